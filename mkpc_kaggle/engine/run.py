@@ -331,14 +331,11 @@ class Run:
         self.store.put({"result": [(job.key, record.to_json())]})
         # The time of the loop, with the process's start: the forecast needs both.
         self.costs.observe_scene(job.matches, seconds)
-        is_best = self.state.use_scene(self.state.batches[job.batch], record, job.scene)
-        text = f"batch {job.batch}: {record.registered} of {plural(record.images, 'image')}"
-        if job.candidate == ALL_UNITS:
-            self._say(f"{text} with a camera")
-        else:
-            # Other candidates are lines of the log.
-            better = "the best so far" if is_best else "not better"
-            logger.debug(f"{text}{_by_tracks(job.candidate)}, {better}")
+        self.state.use_scene(self.state.batches[job.batch], record, job.scene)
+        images = f"{record.registered} of {plural(record.images, 'image')} with a camera"
+        text = f"batch {job.batch}: {images}{_by_tracks(job.candidate)}"
+        # Other candidates are lines of the log.
+        (self._say if job.candidate == ALL_UNITS else logger.debug)(text)
         if job.folder is not None:
             self._publish()  # tables of cameras should agree with COLMAP's files
 

@@ -407,8 +407,8 @@ class State:
         self.inliers[index] = sum(facts["inliers"].values())
         self._note_change(index)
 
-    def use_scene(self, batch: int, record: SceneRecord, first: str) -> bool:
-        """Use a candidate of a batch, whose first one has the key ``first``. Return whether it is the best so far.
+    def use_scene(self, batch: int, record: SceneRecord, first: str) -> None:
+        """Use a candidate of a batch, whose first one has the key ``first``.
 
         The first candidate is used even if it is stale: the former scene is older still. Further ones are
         used only if they are from the same results, and today's.
@@ -418,7 +418,7 @@ class State:
             made.clear()
             self.stale[batch] = self.scene_inputs(batch)[1] != first
         elif self.stale[batch] or ALL_UNITS not in made or made[ALL_UNITS].key != first:
-            return False
+            return
         made[record.candidate] = record
         scene = self.scene(batch)
         members = self.members[batch]
@@ -430,7 +430,6 @@ class State:
                 self.by_scene[index] = choice.F
                 # F at the scene's focal lengths is still the pair's own.
                 self.scene_source[index] = SCENE if choice.from_scene else PAIR
-        return scene.candidate == record.candidate
 
     def _note_change(self, index: int) -> None:
         """Note that a pair has other inputs for its scene than before: points, or an estimate."""
