@@ -45,20 +45,10 @@ def look_at(
     sin = np.sin(np.radians(roll))
     # The rows of R are the camera's axes in the world.
     R = np.stack([cos * right + sin * down, cos * down - sin * right, forward])
-    width, height = size
+    K = np.diag([focal, focal, 1.0])
     # Pixel centres are at integers, so the middle of n pixels is at (n - 1) / 2.
-    centre_x = (width - 1) / 2
-    centre_y = (height - 1) / 2
-    K = np.array(
-        [
-            [focal, 0, centre_x],
-            [0, focal, centre_y],
-            [0, 0, 1],
-        ],
-        dtype=np.float64,
-    )
-    t = -R @ centre
-    return SizedCamera(K, R, t, width, height)
+    K[:2, 2] = (np.array(size) - 1) / 2
+    return SizedCamera(K, R, -R @ centre, *size)
 
 
 def resized_camera(camera: SizedCamera, scale: float) -> SizedCamera:
@@ -68,13 +58,7 @@ def resized_camera(camera: SizedCamera, scale: float) -> SizedCamera:
     half a pixel on the right and at the bottom.
     """
     offset = (scale - 1) / 2  # (x + 0.5) s - 0.5 = s x + (s - 1) / 2
-    to_resized = np.array(
-        [
-            [scale, 0, offset],
-            [0, scale, offset],
-            [0, 0, 1],
-        ]
-    )
+    to_resized = np.array([[scale, 0, offset], [0, scale, offset], [0, 0, 1]])
     width = max(1, round(camera.width * scale))
     height = max(1, round(camera.height * scale))
     return replace(camera, K=to_resized @ camera.K, width=width, height=height)
@@ -123,15 +107,14 @@ def visible_mask(
     pixels, expected = project(second, unproject(first, sampled, finite_depth))
 
     last_pixel = (second.width - 1, second.height - 1)
-    inside = (pixels >= 0).all(axis=1)
-    inside &= (pixels <= last_pixel).all(axis=1)
+    inside = ((pixels >= 0) & (pixels <= last_pixel)).all(axis=1)
     inside &= expected > 0
 
     # On a plane, 1 / depth is linear in the pixel, so bilinear interpolation is exact.
     # Any pixel will do for points outside, which ``inside`` excludes.
     read = np.where(inside[:, None], pixels, 0)
     maps = read.astype(np.float32).reshape(*x.shape, 2)
-    nearness = np.float32(1) / second_depth
+    nearness = 1 / second_depth
     found = cv2.remap(nearness, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
     agrees = np.abs(found * expected.reshape(x.shape) - 1) < DEPTH_TOLERANCE
     return np.asarray(is_surface & inside.reshape(x.shape) & agrees, dtype=np.bool_)

@@ -2,11 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mkpc_kaggle.demo.camera import FloatImage, Floats, SizedCamera, project, resized_camera
 from mkpc_kaggle.geometry.coordinates import Pixels
@@ -22,21 +21,26 @@ MIN_DEPTH = 1e-3  # metres
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The points `origin + u edge_u + v edge_v` for u, v in [0, 1], each (3,) float64 in metres.
+    """A parallelogram by its top left, top right and bottom left corner, as seen from its front.
 
-    The texture is (H, W, 3) uint8 BGR, with its first row at v = 0. A surface is visible only from
-    its front, where `edge_u` points right and `edge_v` down.
+    Corners are in metres. The texture is (H, W, 3) uint8 BGR. A surface is visible only from its front.
     """
 
-    origin: Floats
-    edge_u: Floats
-    edge_v: Floats
+    corners: ArrayLike  # (3, 3)
     texture: Pixels
+
+    @property
+    def axes(self) -> Floats:
+        """The top left corner, and the edges to the right and down, as rows (3, 3)."""
+        corners = np.array(self.corners, np.float64)
+        corners[1:] -= corners[0]
+        return corners
 
     @property
     def normal(self) -> Floats:
         """The unit vector towards the front, (3,)."""
-        normal = np.cross(self.edge_v, self.edge_u)
+        _, right, down = self.axes
+        normal = np.cross(down, right)
         return np.asarray(normal / np.linalg.norm(normal))
 
     @property
@@ -57,7 +61,7 @@ def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage
     nearness = np.zeros(image.shape[:2], np.float32)  # 1 / depth, 0 for the sky
     for surface in surfaces:
         # Its back faces the camera.
-        if surface.normal @ (camera.centre - surface.origin) < MIN_DEPTH:
+        if surface.normal @ (camera.centre - surface.axes[0]) < MIN_DEPTH:
             continue
         _draw(surface, fine, image, nearness)
     # The mean of a pixel's rays.
@@ -73,7 +77,8 @@ def _draw(
     """Draw a surface where nothing nearer is drawn: change the image and ``nearness`` in place."""
     rows, columns = _extent(surface, camera)
     # A (x, y, 1) = (u, v, 1) / depth is affine in the pixel. So comparisons need no division.
-    axes = np.column_stack([surface.edge_u, surface.edge_v, surface.origin - camera.centre])
+    corner, right, down = surface.axes
+    axes = np.column_stack([right, down, corner - camera.centre])
     A = np.linalg.inv(camera.K @ camera.R @ axes).astype(np.float32)
     y, x = (axis.astype(np.float32) for axis in np.ogrid[rows, columns])
     # x is a row and y a column, so only the outer sum has the size of the image.
@@ -88,9 +93,9 @@ def _draw(
     # From here on the depth, where the surface is hit.
     np.divide(1, inverse, out=inverse, where=hit)
     texture = surface.shaded
-    half = np.float32(0.5)  # a texture's first pixel centre is half a pixel from its edge
-    texture_x = u * inverse * texture.shape[1] - half
-    texture_y = v * inverse * texture.shape[0] - half
+    # A texture's first pixel centre is half a pixel from its edge.
+    texture_x = u * inverse * texture.shape[1] - 0.5
+    texture_y = v * inverse * texture.shape[0] - 0.5
     colours = cv2.remap(
         texture, texture_x, texture_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
@@ -102,9 +107,8 @@ def _extent(surface: Surface, camera: SizedCamera) -> tuple[slice, slice]:
 
     All of them if the surface reaches behind the camera, where its projection has no outline.
     """
-    corners = []
-    for i, j in product((0, 1), repeat=2):
-        corners.append(surface.origin + i * surface.edge_u + j * surface.edge_v)
+    corner, right, down = surface.axes
+    corners = [corner, corner + right, corner + down, corner + right + down]
     pixels, depth = project(camera, np.array(corners))
     size = (camera.width, camera.height)
     if (depth < MIN_DEPTH).any():

@@ -11,30 +11,27 @@ from mkpc_kaggle.demo.camera import Floats, SizedCamera, look_at, resized_camera
 from mkpc_kaggle.demo.render import Surface
 from mkpc_kaggle.geometry.coordinates import Pixels
 
-Bgr = tuple[int, int, int]
-
 TEXELS = 72  # per metre
 
 # Colours of the ground, the three walls and their windows.
 PAVING = (128, 136, 140)
-STONE = (150, 175, 190)
+SANDSTONE = (150, 175, 190)
 BRICK = (85, 105, 165)
 PLASTER = (150, 200, 215)
 GLASS = (75, 70, 60)
 FRAME = (205, 215, 220)
 
-# Of the shapes of a texture: maximum side in metres, maximum aspect, contrast
-STONE_LEAVES = (1.2, 0.6, 0.06)
-PAINT_LEAVES = (0.9, 1.0, 0.4)
+# Of the shapes of a texture: the largest in metres, the largest aspect, and the contrast
+STONE = (1.2, 0.6, 0.06)
+PAINT = (0.9, 1.0, 0.4)
 WINDOW_M = (1.3, 1.9)  # width, height
 WINDOW_STEP_M = 3.1  # between the left or lower edges of two windows
 # The grid of places for boxes, before each is moved by up to a metre.
 COLUMNS_X_M = (-9.0, -4.5, 0.0, 4.5, 9.0)
 ROWS_Y_M = (9.0, 12.5, 16.0)
 BOX_SHARE = 0.65  # of the places that have a box
-# Width, depth, height of a box.
-MIN_BOX_M = (1.0, 1.0, 1.0)
-MAX_BOX_M = (3.0, 3.0, 5.5)
+MIN_BOX_M = 1.0
+MAX_BOX_M = (3.0, 3.0, 5.5)  # width, depth, height
 
 
 class Shot(NamedTuple):
@@ -45,13 +42,6 @@ class Shot(NamedTuple):
     focal: float  # over the long side
     size: tuple[int, int]
     roll: float  # in degrees
-
-
-class DemoScene(NamedTuple):
-    """The cameras of a scene; ``metres_per_unit`` is of the written poses."""
-
-    metres_per_unit: float
-    shots: tuple[Shot, ...]
 
 
 SHOTS = (
@@ -79,25 +69,19 @@ TELEPHOTO = (
     Shot((4.0, -3.0, 1.8), (3.0, 17.0, 3.0), 3.00, TELE, 0),
     Shot((1.0, -2.0, 1.8), (7.0, 18.0, 4.0), 3.00, TELE, 4),
 )
-SCENES = {
-    "courtyard": DemoScene(2.5, SHOTS),
-    "market": DemoScene(1.0, SHOTS),
-    "street": DemoScene(1.0, TELEPHOTO),
-}
+SCENES = {"courtyard": SHOTS, "market": SHOTS, "street": TELEPHOTO}
 
 
-def build_world(
-    name: str, *, seed: int = 0, image_scale: float = 1.0
-) -> tuple[list[Surface], list[SizedCamera]]:
+def build_world(name: str, *, image_scale: float = 1.0) -> tuple[list[Surface], list[SizedCamera]]:
     """Return the surfaces and cameras of a world, in metres.
 
-    Only the name and the seed decide its content.
+    Only the name decides its content.
     """
-    rng = np.random.default_rng([seed, *name.encode()])
+    rng = np.random.default_rng([0, *name.encode()])
     # All draws come from one generator: another order would change every world.
     surfaces = _surfaces(rng)
     cameras = []
-    for position, target, focal, size, roll in SCENES[name].shots:
+    for position, target, focal, size, roll in SCENES[name]:
         eye = np.add(position, rng.uniform(-0.15, 0.15, 3))
         towards = np.add(target, rng.uniform(-0.3, 0.3, 3))
         turned = roll + rng.uniform(-2, 2)
@@ -111,16 +95,11 @@ def _surfaces(rng: np.random.Generator) -> list[Surface]:
 
     The ground comes first, then the north wall (at y = 20), the west wall, the east wall and boxes.
     """
-    paving = paint(rng, 40, 34, PAVING, is_stone=True)
-    north = facade(rng, 28, 10, STONE)
-    west = facade(rng, 34, 8.5, BRICK)
-    east = facade(rng, 22, 7.5, PLASTER)
-    # Corners: top left, top right, bottom left, as seen from the courtyard.
     surfaces = [
-        quad((-20, 20, 0), (20, 20, 0), (-20, -14, 0), paving),
-        quad((-14, 20, 10), (14, 20, 10), (-14, 20, 0), north),
-        quad((-14, -14, 8.5), (-14, 20, 8.5), (-14, -14, 0), west),
-        quad((14, 20, 7.5), (14, -2, 7.5), (14, 20, 0), east),
+        Surface(((-20, 20, 0), (20, 20, 0), (-20, -14, 0)), paint(rng, 40, 34, PAVING, STONE)),
+        Surface(((-14, 20, 10), (14, 20, 10), (-14, 20, 0)), facade(rng, 28, 10, SANDSTONE)),
+        Surface(((-14, -14, 8.5), (-14, 20, 8.5), (-14, -14, 0)), facade(rng, 34, 8.5, BRICK)),
+        Surface(((14, 20, 7.5), (14, -2, 7.5), (14, 20, 0)), facade(rng, 22, 7.5, PLASTER)),
     ]
     for x, y in product(COLUMNS_X_M, ROWS_Y_M):
         if rng.random() < BOX_SHARE:
@@ -136,76 +115,51 @@ def box(rng: np.random.Generator, centre: Floats, size: Floats, yaw: float) -> l
     `centre` is (x, y), `size` is (width, depth, height), `yaw` is in degrees.
     """
     width, depth, height = size.tolist()
-    cos = np.cos(np.radians(yaw))
-    sin = np.sin(np.radians(yaw))
-    # The four corners (4, 2) of the ground plan, counter-clockwise from above.
-    signs = np.array(
-        [
-            [-1, -1],
-            [1, -1],
-            [1, 1],
-            [-1, 1],
-        ]
-    )
-    # For points as rows, so it is the transpose of the usual rotation.
-    turn = np.array(
-        [
-            [cos, sin],
-            [-sin, cos],
-        ]
-    )
-    unturned = signs * (width / 2, depth / 2)
-    corners = unturned @ turn + centre
-    low = np.column_stack([corners, np.full(4, 0.0)])
-    high = np.column_stack([corners, np.full(4, height)])
-
-    # Colours of one box are tones of one colour.
-    blue, green, red = rng.integers(60, 205, 3).tolist()
-    colour = (blue, green, red)
-    lid = paint(rng, width, depth, colour)
-    found = [quad(high[3], high[2], high[0], lid)]
-    # Side i is between the corners i - 1 and i; the first is the one from corner 3 to corner 0.
-    for i, width_m in enumerate((depth, width, depth, width)):
-        side = paint(rng, width_m, height, colour)
-        found.append(quad(high[i - 1], high[i], low[i - 1], side))
+    # Counter-clockwise from above, beginning with the first side's left end.
+    signs = np.array([[-1, 1], [-1, -1], [1, -1], [1, 1]])
+    turn = cv2.getRotationMatrix2D((0, 0), yaw, 1)[:, :2]
+    corners = signs * (width / 2, depth / 2) @ turn + centre
+    low = np.column_stack([corners, np.zeros(4)])
+    high = np.add(low, (0, 0, height))
+    colour = rng.integers(60, 205, 3)  # the sides have tones of it
+    found = [Surface((high[0], high[3], high[1]), paint(rng, width, depth, colour, PAINT))]
+    for left, width_m in enumerate((depth, width, depth, width)):
+        side = paint(rng, width_m, height, colour, PAINT)
+        found.append(Surface((high[left], high[(left + 1) % 4], low[left]), side))
     return found
-
-
-def quad(
-    top_left: ArrayLike, top_right: ArrayLike, bottom_left: ArrayLike, picture: Pixels
-) -> Surface:
-    """Return the rectangle with these corners (3,), named as seen from the front."""
-    corner = np.asarray(top_left, dtype=np.float64)
-    edge_u = np.subtract(top_right, corner)
-    edge_v = np.subtract(bottom_left, corner)
-    return Surface(corner, edge_u, edge_v, picture)
 
 
 def paint(
     rng: np.random.Generator,
     width_m: float,
     height_m: float,
-    colour: Bgr,
-    *,
-    is_stone: bool = False,
+    colour: ArrayLike,
+    leaves: tuple[float, float, float],
 ) -> Pixels:
     """Draw a dead-leaves texture: shapes of all sizes in tones of the colour.
 
-    Source: Lee, Mumford and Huang 2001. The shapes are upright rectangles for stone, rotated
-    ellipses with stronger tones for paint.
+    Upright rectangles for stone, turned ellipses for paint.
+
+    Source: Lee, Mumford and Huang 2001. Later leaves cover earlier ones, so the largest come first.
+    Their density falls with the third power of their size: the texture looks alike at every scale.
     """
     scale = min(TEXELS, 2000 / max(width_m, height_m))  # at most 2,000 pixels a side
     width = max(16, round(width_m * scale))
     height = max(16, round(height_m * scale))
     picture = np.full((height, width, 3), colour, dtype=np.uint8)
     count = width * height // 60
-    max_side_m, max_aspect, contrast = STONE_LEAVES if is_stone else PAINT_LEAVES
-    sides = _leaf_sides(rng, count, max_side_m * scale, max_aspect)
+    largest_m, max_aspect, contrast = leaves
+    # From three texels on
+    draws = rng.uniform((3 / (largest_m * scale)) ** 2, 1, count)
+    lengths = np.sort(3 / np.sqrt(draws))[::-1]
+    sides = np.column_stack([lengths, lengths * rng.uniform(0.3, max_aspect, count)])
     centres = rng.uniform((0, 0), (width, height), (count, 2))
     angles = rng.uniform(0, 180, count)
-    tones = _leaf_tones(rng, count, colour, contrast)
+    # They differ mostly in brightness and a little in hue.
+    shades = 1 + rng.normal(0, contrast, (count, 1)) + rng.normal(0, 0.2 * contrast, (count, 3))
+    tones = (np.array(colour) * shades).clip(8, 250).tolist()
     for centre, side, angle, tone in zip(centres, sides, angles, tones, strict=True):
-        if is_stone:
+        if leaves is STONE:
             low = (centre - side / 2).astype(int)
             high = (centre + side / 2).astype(int)
             cv2.rectangle(picture, low, high, tone, -1)
@@ -214,49 +168,23 @@ def paint(
     return picture
 
 
-def _leaf_sides(rng: np.random.Generator, count: int, max_side: float, max_aspect: float) -> Floats:
-    """Draw the sides (count, 2) of shapes in pixels, from three to ``max_side``, largest first.
-
-    Later shapes cover earlier ones, so small ones stay visible. Their density falls with the third
-    power of their size: the texture looks alike at every scale.
-    """
-    draws = rng.uniform((3 / max_side) ** 2, 1, count)
-    lengths = np.sort(3 / np.sqrt(draws))[::-1]
-    aspects = rng.uniform(0.3, max_aspect, count)
-    shapes = np.column_stack([np.ones(count), aspects])
-    return np.asarray(lengths[:, None] * shapes)
-
-
-def _leaf_tones(
-    rng: np.random.Generator, count: int, colour: Bgr, contrast: float
-) -> list[list[float]]:
-    """Draw the BGR colours of shapes, which differ mostly in brightness and a little in hue."""
-    brightness = rng.normal(0, contrast, (count, 1))
-    hue = rng.normal(0, 0.2 * contrast, (count, 3))
-    tones = np.array(colour) * (1 + brightness + hue)
-    found: list[list[float]] = tones.clip(8, 250).tolist()
-    return found
-
-
-def facade(rng: np.random.Generator, width_m: float, height_m: float, colour: Bgr) -> Pixels:
+def facade(rng: np.random.Generator, width_m: float, height_m: float, colour: ArrayLike) -> Pixels:
     """Draw a stone wall with a grid of windows that differ only in brightness."""
-    picture = paint(rng, width_m, height_m, colour, is_stone=True)
+    picture = paint(rng, width_m, height_m, colour, STONE)
     scale = picture.shape[1] / width_m
-    window_w, window_h = WINDOW_M
-    w = int(window_w * scale)
-    h = int(window_h * scale)
+    width, height = WINDOW_M
+    w = int(width * scale)
+    h = int(height * scale)
     # One pane for all windows: repetition is what makes facades hard to match.
-    glass = paint(rng, window_w, window_h, GLASS)
-    pane = cv2.resize(glass, (w, h))
-    # The first windows are 1.2 m above the ground and from the left edge.
-    for z in np.arange(1.2, height_m - window_h, WINDOW_STEP_M):
-        for x in np.arange(1.2, width_m - window_w, WINDOW_STEP_M):
+    pane = cv2.resize(paint(rng, width, height, GLASS, PAINT), (w, h))
+    # The first windows are 1.2 m from the edges.
+    for y in np.arange(1.2, height_m - height, WINDOW_STEP_M):
+        for x in np.arange(1.2, width_m - width, WINDOW_STEP_M):
             left = int(x * scale)
-            top = picture.shape[0] - int(z * scale) - h  # rows run down, z runs up
+            bottom = picture.shape[0] - int(y * scale)  # rows run down
             # A frame of six pixels; OpenCV's rectangles include both corners.
-            first = (left - 6, top - 6)
-            last = (left + w + 5, top + h + 5)
-            cv2.rectangle(picture, first, last, FRAME, -1)
+            frame = (left - 6, bottom - h - 6, w + 12, h + 12)
+            cv2.rectangle(picture, frame, FRAME, -1)
             lit = np.clip(pane * rng.uniform(0.7, 1.6), 0, 255)
-            picture[top : top + h, left : left + w] = lit
+            picture[bottom - h : bottom, left : left + w] = lit
     return picture

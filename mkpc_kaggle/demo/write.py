@@ -21,17 +21,15 @@ from mkpc_kaggle.progress import counted
 
 MIN_COVISIBILITY = 0.1  # minimum of a pair that the competition scores
 TEST_PAIRS = 8  # per scene
+METRES_PER_UNIT = 2.5  # of the written poses
 MARK = "demo.txt"  # the file that says that a directory is ours to overwrite
-MARK_TEXT = (
-    "Rendered by mkpc_kaggle. The command `demo` replaces train/, test/ and test_truth.csv.\n"
-)
+MARK_TEXT = "The command `demo` replaces train/, test/ and test_truth.csv.\n"
 
 
 @dataclass(frozen=True)
 class DemoSet:
     """The folders of a demo set; `truth_csv` names the train images of each test pair."""
 
-    root: Path
     train_dir: Path
     test_dir: Path
     truth_csv: Path
@@ -62,42 +60,39 @@ def write_demo(
     The same arguments give the same bytes. `image_scale` scales all images and their K.
     Raises :class:`UserError` if `directory` has train or test data that `demo` did not write.
     """
-    demo = DemoSet(directory, directory / "train", directory / "test", directory / "test_truth.csv")
-    _claim(demo)
+    demo = DemoSet(directory / "train", directory / "test", directory / "test_truth.csv")
+    _claim(directory, demo)
     scenes = scenes or tuple(SCENES)
-    metres = {scene: SCENES[scene].metres_per_unit for scene in scenes}
-    samples: list[str] = []
-    truths: list[str] = []
+    rows: list[tuple[str, str]] = []
     for scene in scenes:
         photographs = take_photographs(scene, image_scale)
         pairs = []
         for a, b in combinations(photographs, 2):
             share = covisibility(b.camera, b.depth, a.camera, a.depth)
             pairs.append(DemoPair(b, a, share))
-        _write_train(demo.train_dir / scene, metres[scene], photographs, pairs)
-        for sample, truth in _write_test(demo.test_dir, scene, _selected(pairs)):
-            samples.append(sample)
-            truths.append(truth)
-    factors = (f"{scene},{metres[scene]:.17g}" for scene in scenes)
+        _write_train(demo.train_dir / scene, photographs, pairs)
+        rows += _write_test(demo.test_dir, scene, _selected(pairs))
+    samples, truths = zip(*rows, strict=True)
+    factors = (f"{scene},{METRES_PER_UNIT}" for scene in scenes)
     _write_rows(demo.train_dir / "scaling_factors.csv", "scene,scaling_factor", factors)
     _write_rows(demo.test_dir / "test.csv", "sample_id,batch_id,image_1_id,image_2_id", samples)
     _write_rows(demo.truth_csv, "sample_id,scene,image_1_id,image_2_id", truths)
     return demo
 
 
-def _claim(demo: DemoSet) -> None:
+def _claim(directory: Path, demo: DemoSet) -> None:
     """Mark the directory as a demo set.
 
     Raises :class:`UserError` if it has data that `demo` did not write.
     """
-    mark = demo.root / MARK
+    mark = directory / MARK
     for path in (demo.train_dir, demo.test_dir, demo.truth_csv):
         # ``exists`` is False for a broken link, which writing would follow.
         if os.path.lexists(path) and not mark.is_file():
             raise UserError(
                 f"{path} is in the way: `demo` did not write it; name an empty directory"
             )
-    demo.root.mkdir(parents=True, exist_ok=True)
+    directory.mkdir(parents=True, exist_ok=True)
     # Before the data: a set that was cut half way is still known as ours.
     mark.write_text(MARK_TEXT)
 
@@ -118,13 +113,12 @@ def _developed(image: FloatImage, rng: np.random.Generator) -> Pixels:
     """Convert an image (H, W, 3) float32 in 0..255 to uint8, with exposure, tint and noise."""
     gain = rng.uniform(0.75, 1.25)
     gamma = rng.uniform(0.85, 1.2)
-    balance = rng.uniform(0.93, 1.07, 3)  # of blue, green and red
-    factors = (balance * gain / 255).astype(np.float32)
-    exposed = np.clip(image * factors, 0, 1)
-    light = exposed ** np.float32(gamma)
+    # Of blue, green and red
+    factors = (rng.uniform(0.93, 1.07, 3) * gain / 255).astype(np.float32)
+    light = np.clip(image * factors, 0, 1) ** gamma
     # The lens first, then the sensor: noise is not blurred.
-    blurred = cv2.GaussianBlur(light, (5, 5), float(rng.uniform(0.3, 0.7)))
-    sigma = np.float32(rng.uniform(0.006, 0.016))  # 1.5 to 4 of 255 grey levels
+    blurred = cv2.GaussianBlur(light, (5, 5), rng.uniform(0.3, 0.7))
+    sigma = rng.uniform(0.006, 0.016)  # 1.5 to 4 of 255 grey levels
     noise = sigma * rng.standard_normal(light.shape, dtype=np.float32)
     levels = np.clip((blurred + noise) * 255, 0, 255)
     return np.asarray(levels.round(), dtype=np.uint8)
@@ -134,24 +128,20 @@ def _selected(pairs: Sequence[DemoPair]) -> list[DemoPair]:
     """Select the test pairs among scored pairs, spread evenly over the ranks of covisibility."""
     scored = [pair for pair in pairs if pair.covisibility >= MIN_COVISIBILITY]
     scored.sort(key=lambda pair: pair.covisibility)
-    count = min(TEST_PAIRS, len(scored))
-    ranks = np.linspace(0, len(scored) - 1, count).round().astype(int)
-    return [scored[rank] for rank in ranks]
+    ranks = np.linspace(0, len(scored) - 1, min(TEST_PAIRS, len(scored)))
+    return [scored[rank] for rank in ranks.round().astype(int)]
 
 
 def _write_train(
-    directory: Path,
-    metres_per_unit: float,
-    photographs: Sequence[Photograph],
-    pairs: Sequence[DemoPair],
+    directory: Path, photographs: Sequence[Photograph], pairs: Sequence[DemoPair]
 ) -> None:
     """Write a scene's images, its cameras in the scene's own units, and its pairs."""
     cameras = []
     for each in photographs:
         path = directory / "images" / f"{each.name}.jpg"
-        _write_image(path, each.picture, cv2.IMWRITE_JPEG_QUALITY, 95)
+        _write_image(path, each.picture)
         camera = each.camera
-        matrices = (camera.K, camera.R, camera.t / metres_per_unit)
+        matrices = (camera.K, camera.R, camera.t / METRES_PER_UNIT)
         cameras.append(",".join([each.name, *map(_numbers, matrices)]))
     header = "image_id,camera_intrinsics,rotation_matrix,translation_vector"
     _write_rows(directory / "calibration.csv", header, cameras)
@@ -173,29 +163,23 @@ def _write_test(
     """
     # Ids of batches and images are digests: like the competition's, they say nothing of the order.
     batch = _digest(f"0/{scene}")[:8]
-    photographs: dict[str, Photograph] = {}
-    for pair in pairs:
-        photographs[pair.first.name] = pair.first
-        photographs[pair.second.name] = pair.second
-    hidden = {name: _digest(f"0/{scene}/{name}")[:32] for name in photographs}
-    for name, each in photographs.items():
-        path = directory / "test_images" / batch / f"{hidden[name]}.png"
-        _write_image(path, each.picture, cv2.IMWRITE_PNG_COMPRESSION, 1)
+    hidden = {}
+    for each in {each.name: each for pair in pairs for each in pair[:2]}.values():
+        hidden[each.name] = _digest(f"0/{scene}/{each.name}")[:32]
+        path = directory / "test_images" / batch / f"{hidden[each.name]}.png"
+        _write_image(path, each.picture)
 
-    for pair in pairs:
-        names = [pair.first.name, pair.second.name]
+    for first, second, _ in pairs:
         # The greater id comes first, as in the competition's files.
-        names.sort(key=hidden.__getitem__, reverse=True)
+        names = sorted((first.name, second.name), key=hidden.__getitem__, reverse=True)
         ids = [hidden[name] for name in names]
         sample = f"{scene};{batch};{'-'.join(ids)}"
-        test_row = f"{sample},{batch},{','.join(ids)}"
-        truth_row = f"{sample},{scene},{','.join(names)}"
-        yield test_row, truth_row
+        yield f"{sample},{batch},{','.join(ids)}", f"{sample},{scene},{','.join(names)}"
 
 
-def _write_image(path: Path, picture: Pixels, option: int, value: int) -> None:
+def _write_image(path: Path, picture: Pixels) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    done, data = cv2.imencode(path.suffix, picture, [option, value])
+    done, data = cv2.imencode(path.suffix, picture)
     if not done:
         raise OSError(f"OpenCV could not encode {path}")
     path.write_bytes(data.tobytes())

@@ -9,8 +9,8 @@ import pytest
 
 from mkpc_kaggle.demo import DemoSet, write_demo
 from mkpc_kaggle.demo.camera import look_at, project, unproject, visible_mask
-from mkpc_kaggle.demo.render import render
-from mkpc_kaggle.demo.world import SCENES, build_world, quad
+from mkpc_kaggle.demo.render import Surface, render
+from mkpc_kaggle.demo.world import SCENES, build_world
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 
 # Scenes at a fifth of their size: nothing below depends on resolution.
@@ -50,7 +50,7 @@ def upright(
     top_left = (*left, high)
     top_right = (*right, high)
     bottom_left = (*left, low)
-    return quad(top_left, top_right, bottom_left, texture)
+    return Surface((top_left, top_right, bottom_left), texture)
 
 
 def test_a_view_warped_by_its_depth_agrees_with_the_other_view():
