@@ -136,8 +136,8 @@ def scores_of_list(found: Results, scene: TrainScene, method: str, side: int) ->
         if pose is not None:
             R, t = pose
             true_R, true_t = relative_pose(true.camera0, true.camera1)
-            cosine = min(1.0, abs(t @ true_t) / np.linalg.norm(true_t))  # the sign is ignored
-            angle = float(np.degrees(np.arccos(cosine)))
+            cosine = float(abs(t @ true_t) / np.linalg.norm(true_t))  # the sign is ignored
+            angle = float(np.degrees(np.arccos(min(1.0, cosine))))
             error = PoseError(rotation_angle(R @ true_R.T), angle, nan)
         # All matches, not only inliers
         correct = int(correct_matches(matches, true.camera0, true.camera1).sum())

@@ -254,7 +254,8 @@ class _Solver(NamedTuple):
 
 def _find_fundamental(points0: Vectors, points1: Vectors, **settings: Any) -> Any:
     """Find F: return OpenCV's matrix and mask. A matrix of rank 3, of some sets of wrong matches, is none."""
-    matrix, mask = cv2.findFundamentalMat(points0, points1, **settings)
+    found: Any = cv2.findFundamentalMat(points0, points1, **settings)
+    matrix, mask = found
     if _is_model(matrix) and not are_models(matrix[None]).all():
         return None, mask
     return matrix, mask
