@@ -39,7 +39,7 @@ from mkpc_kaggle.geometry.metrics import (
     AUC_THRESHOLDS,
     PoseError,
     pose_auc,
-    pose_error,
+    rotation_angle,
 )
 from mkpc_kaggle.geometry.robust import calibrate, homogeneous
 from mkpc_kaggle.geometry.two_view import cross_matrix
@@ -135,9 +135,10 @@ def scores_of_list(found: Results, scene: TrainScene, method: str, side: int) ->
         pose = pose_of(matches, true, method, side)
         if pose is not None:
             R, t = pose
-            E = cross_matrix(t) @ R
-            cameras = true.camera0.calibrated, true.camera1.calibrated
-            error = pose_error(E, *cameras, nan, R)
+            true_R, true_t = relative_pose(true.camera0, true.camera1)
+            cosine = float(abs(t @ true_t) / np.linalg.norm(true_t))  # the sign is ignored
+            angle = float(np.degrees(np.arccos(min(1.0, cosine))))
+            error = PoseError(rotation_angle(R @ true_R.T), angle, nan)
         # All matches, not only inliers
         correct = int(correct_matches(matches, true.camera0, true.camera1).sum())
         ran = units.get(true.pair.id)

@@ -1,8 +1,8 @@
 """Progress of a wait: tqdm's bars, and the text of a duration."""
 
 import sys
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from typing import TextIO, TypeVar
 
 LINE_INTERVAL_S = 30.0  # between lines where a line cannot be redrawn in place
@@ -41,10 +41,3 @@ def is_terminal(stream: TextIO | None) -> bool:
         return stream is not None and stream.isatty()
     except ValueError:  # a closed stream
         return False
-
-
-@contextmanager
-def announced(text: str) -> Iterator[None]:
-    """Print what is going to take long."""
-    print_to(sys.stderr, text)
-    yield

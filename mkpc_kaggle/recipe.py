@@ -5,7 +5,7 @@ A recipe is a TOML file: ``mkpc_kaggle/recipes/NAME.toml`` or a custom file.
 
 import re
 import tomllib
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Container, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
@@ -254,10 +254,6 @@ class Recipe:
         """Distinct matchers, in order of first use."""
         return tuple(dict.fromkeys(unit.matcher for unit in self.units))
 
-    def only(self, wanted: Callable[[Unit], bool]) -> "Recipe":
-        """Return the recipe with only the units that ``wanted`` accepts."""
-        return replace(self, units=tuple(filter(wanted, self.units)))
-
     def without(self, matchers: Container[str]) -> "Recipe":
         """Return the recipe without the units of these matchers.
 
@@ -275,7 +271,8 @@ class Recipe:
             return self
         name = f"{self.name} ({mode})"
         if mode is Mode.STAGE_1:
-            return replace(self.only(lambda unit: unit.stage == 1), name=name)
+            units = tuple(unit for unit in self.units if unit.stage == 1)
+            return replace(self, name=name, units=units)
         # A unit of both stages runs once: a second run would find the same matches.
         whole: dict[str, Unit] = {}
         for unit in self.units:

@@ -56,7 +56,7 @@ def test_any_remaining_matchers_of_recipe_auto_begin_with_a_unit_of_stage_1():
     assert set(MATCHERS) == set(names)
     for count in range(1, len(names) + 1):
         for kept in combinations(names, count):
-            remaining = recipe.only(lambda unit, kept=kept: unit.matcher in kept)
+            remaining = recipe.without(set(names).difference(kept))
             assert set(remaining.matcher_names) == set(kept)
             assert remaining.units[0].stage == 1
 

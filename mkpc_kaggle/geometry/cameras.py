@@ -1,6 +1,6 @@
 """Calibrated cameras, and the exact two-view geometry of two cameras."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +26,6 @@ class Camera:
     def centre(self) -> NDArray[np.float64]:
         """Position in the world, (3,)."""
         return -self.R.T @ self.t
-
-    @property
-    def calibrated(self) -> "Camera":
-        """The same camera with K the identity. F of two calibrated cameras is their E."""
-        return replace(self, K=np.eye(3))
 
 
 def relative_pose(camera0: Camera, camera1: Camera) -> tuple[Matrix3, NDArray[np.float64]]:

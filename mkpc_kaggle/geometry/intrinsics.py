@@ -7,22 +7,19 @@ its centre.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
-from types import MappingProxyType
 
 # Parameters of COLMAP's models of usual lenses, the last ones fisheyes
-LENS_MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-        "PINHOLE": ("fx", "fy", "cx", "cy"),
-        "SIMPLE_RADIAL": ("f", "cx", "cy", "k"),
-        "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-        "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-        "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-        "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k"),
-        "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
-        "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
-    }
-)
+LENS_MODELS: Mapping[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+}
 
 
 @dataclass(frozen=True)

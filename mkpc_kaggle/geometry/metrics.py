@@ -45,23 +45,16 @@ class PoseError:
         return max(self.rotation, self.translation_angle)
 
 
-def pose_error(
-    F: Matrix3,
-    camera0: Camera,
-    camera1: Camera,
-    metres_per_unit: float,
-    rotation: Matrix3 | None = None,
-) -> PoseError:
-    """Return the pose error of F, or of F's translation with a given ``rotation``.
+def pose_error(F: Matrix3, camera0: Camera, camera1: Camera, metres_per_unit: float) -> PoseError:
+    """Return the pose error of F.
 
-    A submission has no points to select one of F's two rotations. So by default the rotation nearer
-    to the truth counts. The sign of the translation is ignored.
+    A submission has no points to select one of F's two rotations. So the rotation nearer to the
+    truth counts. The sign of the translation is ignored.
     """
     R, t = relative_pose(camera0, camera1)
     # Two rotations, and a direction (3, 1) of unknown sign (Hartley and Zisserman, Multiple View
     # Geometry, 9.6.2).
-    *both, column = cv2.decomposeEssentialMat(camera1.K.T @ F @ camera0.K)
-    rotations = both if rotation is None else [rotation]
+    *rotations, column = cv2.decomposeEssentialMat(camera1.K.T @ F @ camera0.K)
     direction = np.ravel(column).astype(np.float64)
     length = float(np.linalg.norm(t))
     cosine = abs(float(direction @ t)) / max(length, np.finfo(float).tiny)

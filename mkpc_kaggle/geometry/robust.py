@@ -165,13 +165,6 @@ def _is_model(matrix: Any) -> bool:
     return bool(np.isfinite(matrix).all() and matrix.any())
 
 
-def is_fundamental(F: Any) -> bool:
-    """Return whether F is a real (3, 3) matrix with finite numbers, of rank 2."""
-    if not isinstance(F, np.ndarray) or F.shape != (3, 3) or F.dtype.kind != "f":
-        return False
-    return bool(are_models(F[None])[0])
-
-
 def are_models(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which of the matrices (N, 3, 3) are finite and of rank 2."""
     finite = np.isfinite(matrices).all((1, 2))
@@ -261,8 +254,9 @@ class _Solver(NamedTuple):
 
 def _find_fundamental(points0: Vectors, points1: Vectors, **settings: Any) -> Any:
     """Find F: return OpenCV's matrix and mask. A matrix of rank 3, of some sets of wrong matches, is none."""
-    matrix, mask = cv2.findFundamentalMat(points0, points1, **settings)
-    if _is_model(matrix) and not is_fundamental(matrix):
+    found: Any = cv2.findFundamentalMat(points0, points1, **settings)
+    matrix, mask = found
+    if _is_model(matrix) and not are_models(matrix[None]).all():
         return None, mask
     return matrix, mask
 

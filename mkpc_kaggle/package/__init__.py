@@ -7,6 +7,7 @@ docs/kernels_metadata.md there.
 import json
 import re
 import shutil
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
@@ -14,7 +15,7 @@ from pathlib import Path
 from string import Template
 
 from mkpc_kaggle.errors import UserError, temporary_directory, writing
-from mkpc_kaggle.progress import announced, counted
+from mkpc_kaggle.progress import counted, print_to
 from mkpc_kaggle.version import __version__
 from mkpc_kaggle.weights import FoundFile, WeightFile, WeightStore, load_tensors
 from mkpc_kaggle.weights.fetch import run_pip
@@ -189,8 +190,8 @@ def build_wheel(checkout: Path, directory: Path) -> None:
     """Build our wheel; the same sources give the same bytes. Raise :class:`UserError`."""
     # If hatchling is not installed, pip downloads it for the build.
     isolation = ["--no-build-isolation"] if find_spec("hatchling") else []
-    with announced("building the wheel of this checkout with pip"):
-        failure = run_pip("wheel", "--no-deps", *isolation, "--wheel-dir", directory, checkout)
+    print_to(sys.stderr, "building the wheel of this checkout with pip")
+    failure = run_pip("wheel", "--no-deps", *isolation, "--wheel-dir", directory, checkout)
     if failure:
         raise UserError(f"the wheel could not be built from {checkout}: {failure}")
 
