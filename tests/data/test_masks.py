@@ -77,6 +77,8 @@ def test_the_reader_keeps_points_on_white_pixels(folder):
 def test_a_folder_without_masks_and_an_unreadable_mask_are_refused(folder):
     with pytest.raises(UserError, match=r"has no mask of any image: 0\.png\.png would be"):
         masks_of(folder)
+    with pytest.raises(UserError, match="has images of the run"):
+        Masks.of_folder(folder / "I", folder / "I", [folder / "I" / "0.png"])
     (folder / "M" / "3.png.png").write_bytes(b"no picture")
     with pytest.raises(UserError, match=r"the mask .*3\.png\.png cannot be read"):
         masks_of(folder)

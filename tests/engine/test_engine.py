@@ -18,6 +18,7 @@ from rectified import (
     write_pairs,
 )
 
+from mkpc_kaggle.engine import keys
 from mkpc_kaggle.engine.frames import Results
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.state import State
@@ -92,14 +93,14 @@ def test_an_interrupted_run_resumes_and_ends_with_the_same_bytes(tmp_path):
     assert second.calls
 
 
-def test_a_finished_run_loads_no_matcher_again(tmp_path, monkeypatch):
+def test_a_finished_run_reads_no_image_and_loads_no_matcher_again(tmp_path, monkeypatch):
     pairs = write_pairs(tmp_path, 3)
     once = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     # Loading gigabytes of weights to find that nothing is missing would take minutes.
-    loaded = []
-    monkeypatch.setattr(Pipeline, "load", lambda *_: loaded.append(1))
+    monkeypatch.setattr(Pipeline, "load", lambda *_: pytest.fail("it is loaded"))
+    monkeypatch.setattr(keys, "_read_facts", lambda *_: pytest.fail("it is read"))
     twice = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert not loaded
+
     assert matrices(once) == matrices(twice)
     assert twice.about.resumed == 3
 

@@ -79,13 +79,15 @@ def test_an_error_costs_the_pictures_and_never_the_run(made, tmp_path, monkeypat
 def test_cameras_are_outlined_where_they_are_and_named():
     pytest.importorskip("plotly")
     far = np.full((1, 3), 1e6)
-    wall = np.random.default_rng(0).uniform((0, -1, 5), (3, 1, 6), (100, 3))
+    wall = np.random.default_rng(0).uniform((0, -3, 5), (3, -1, 6), (100, 3))  # above them
     points, frusta, centres = view(cameras(), np.vstack([wall, far])).data
     assert list(centres.text) == ["0.png", "1.png", "2.png", "3.png"]
     # x right, y ahead, z up
     np.testing.assert_allclose(np.array([centres.x, centres.y, centres.z]).T[3], (3, 0, 0))
     assert len(points.x) <= 100
     assert min(points.y) > 4
+    assert min(points.z) > 0
+
     # Pictures are ahead, at a share of the distance between cameras, or of the extent.
     assert np.nanmax(frusta.y) == pytest.approx(0.4, abs=0.1)
     assert np.nanmax(frusta.x) == pytest.approx(3 + np.nanmax(frusta.y) / 2, abs=0.01)

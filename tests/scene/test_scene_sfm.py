@@ -26,8 +26,9 @@ from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.choose import Reason
-from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch
-from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
+from mkpc_kaggle.scene.keypoints import MergedGraph
+from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch, reconstruct_connected
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph
 
 
 @pytest.fixture(scope="module")
@@ -277,6 +278,18 @@ def test_an_edge_is_verified_once_for_the_same_cameras_on_any_number_of_threads(
             dump = list(database.iterdump())
         written.append(dump)
     assert written[0] == written[1]
+
+
+def test_a_refinement_without_the_matches_of_an_image_leaves_the_image_out(scene):
+    whole = MergedGraph(ViewGraph.of_pairs(scene.pairs))
+    first = reconstruct_connected(whole, {}, config=SceneConfig())
+    assert first.registered == 6
+    edges = [edge for edge in whole.graph.edges if 3 not in (edge.first, edge.second)]
+    lacking = MergedGraph(replace(whole.graph, edges=tuple(edges)))
+    second = reconstruct_connected(lacking, {}, first.models, config=SceneConfig())
+    assert second.failure == ""
+    names = {found.image.name for found in second.models[0].images}
+    assert names == {*scene.cameras} - {"0003"}
 
 
 def test_a_point_behind_a_camera_counts_for_nothing(scene, monkeypatch):
