@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
-from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig
+from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.crop_need import CropNeed
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
@@ -72,8 +72,6 @@ class PairMatch:
         Width and height, and the focal length by EXIF, of each image, in pixels.
     failure : str
         The image that cannot be read.
-    mkpc : MkpcConfig
-        The settings of MKPC, for ``plot()``.
     scale : float
         The ratio of the scales of both images, known with the regions.
 
@@ -92,7 +90,6 @@ class PairMatch:
     sizes: tuple[Size, ...] = ()
     focals: tuple[float, ...] = ()
     failure: str = ""
-    mkpc: MkpcConfig = field(default_factory=MkpcConfig)
     scale: float = 1.0
 
     @property
@@ -110,8 +107,8 @@ class PairMatch:
         """The matches within MAGSAC's threshold of the model."""
         return self.matches[self.estimate.inliers]
 
-    def plot(self, image0: "ImageSource", image1: "ImageSource") -> "Figure":
-        """Draw the matches, the clusters and the critical regions on the two images.
+    def plot(self, image0: ImageSource, image1: ImageSource) -> "Figure":
+        """Draw the matches and the critical regions on the two images.
 
         Raises ``ValueError`` for images of another size, and :class:`mkpc_kaggle.errors.UserError`
         without matplotlib.

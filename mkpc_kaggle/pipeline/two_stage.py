@@ -176,5 +176,4 @@ class TwoStageMatcher:
             images=(),
             sizes=tuple(image.size for image in images),
             focals=tuple(image.focal for image in images),
-            mkpc=self.recipe.mkpc,
         )
