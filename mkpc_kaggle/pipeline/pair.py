@@ -110,15 +110,11 @@ class PairMatch:
     def plot(self, image0: ImageSource, image1: ImageSource) -> "Figure":
         """Draw the matches and the critical regions on the two images.
 
-        Raises ``ValueError`` for images of another size, and :class:`mkpc_kaggle.errors.UserError`
-        without matplotlib.
+        Raises :class:`mkpc_kaggle.errors.UserError` without matplotlib.
         """
         from mkpc_kaggle.pipeline.drawing import draw_pair  # it draws this class
 
-        images = (as_image(image0), as_image(image1))
-        if self.sizes and tuple(image.size for image in images) != self.sizes:
-            raise ValueError("an image has another size than the matched one")
-        return draw_pair(images, self)
+        return draw_pair((as_image(image0), as_image(image1)), self)
 
     def in_stage(self, stage: int) -> NDArray[np.bool_]:
         """Return the (N,) mask of the ``matches`` that units of this stage found."""
