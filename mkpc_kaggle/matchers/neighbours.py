@@ -1,13 +1,14 @@
 """Mutual nearest neighbours of descriptors, in blocks of the N x M matrix."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import PairwiseMatcher
-from mkpc_kaggle.matchers.sparse import Keypoints, matches_of
+from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture
+from mkpc_kaggle.matchers.sparse import Encode, Keypoints, matches_of
 
 # On a CPU, a block of 512 x 8,000 similarities fits the cache. A GPU is idle between small blocks.
 BLOCK_ROWS = {"cpu": 512, "cuda": 8192}
@@ -31,7 +32,13 @@ class Neighbours:
 class NeighbourMatcher(PairwiseMatcher[Keypoints]):
     """Mutual nearest neighbours with a distance ratio up to ``ratio``, scored by their cosine."""
 
-    ratio = 1.0
+    def __init__(self, spec: MatcherSpec, encode: Encode, ratio: float) -> None:
+        self.spec = spec
+        self.ratio = ratio
+        self._encode = encode
+
+    def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
+        return self._encode(pictures)
 
     def _match(self, first: Keypoints, second: Keypoints) -> Matches:
         pairs = mutual_neighbours(first.descriptors, second.descriptors, self.ratio)

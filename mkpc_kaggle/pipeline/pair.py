@@ -1,6 +1,6 @@
 """A pair on its way through the stages: results of units, critical regions, the two-view model."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
