@@ -61,9 +61,7 @@ class LightGlueMatcher(PairwiseMatcher[Keypoints]):
             _positions(keypoints1),
             keypoints1.descriptors,
         )
-        return matches_of(
-            keypoints0.points, keypoints1.points, found.index0, found.index1, found.scores
-        )
+        return matches_of(keypoints0.points, keypoints1.points, found)
 
 
 def _positions(keypoints: Keypoints) -> Tensor:

@@ -78,12 +78,11 @@ class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
         return encodings
 
     def _match(self, first: SemiDenseEncoding, second: SemiDenseEncoding) -> Matches:
-        mask0 = first.mask
-        mask1 = second.mask
+        masks = (first.mask, second.mask)
         # No masks for pictures without padding: even a mask that is True everywhere can change
         # rounding.
-        is_whole = bool(mask0.all() and mask1.all())
-        found = self._network.match(first.maps, second.maps, None if is_whole else (mask0, mask1))
+        is_whole = bool(masks[0].all() and masks[1].all())
+        found = self._network.match(first.maps, second.maps, None if is_whole else masks)
         # The networks count pixels from the image's corner.
         points0 = from_corner(found.points0.float().cpu().numpy())
         points1 = from_corner(found.points1.float().cpu().numpy())

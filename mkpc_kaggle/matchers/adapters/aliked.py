@@ -20,8 +20,6 @@ class AlikedVariant(StrEnum):
     N32 = "n32"
 
 
-# Points around a keypoint at which its descriptor is read.
-POSITIONS = {AlikedVariant.N16: 16, AlikedVariant.N16ROT: 16, AlikedVariant.N32: 32}
 SLOT = "aliked-{variant}"
 
 
@@ -45,7 +43,7 @@ def load_encoder(
 ) -> Encode:
     """Load ALIKED's encoder, which all matchers of ALIKED keypoints share."""
     slot = SLOT.format(variant=variant)
-    network = Aliked(features, POSITIONS[variant])
+    network = Aliked(features, positions=32 if variant is AlikedVariant.N32 else 16)
     tensors = {own_name(name): tensor for name, tensor in weights.load(slot).items()}
     load_into(network, tensors, what=slot)
     return aliked_encoder(network, placement)

@@ -26,10 +26,7 @@ class LoftrTransformer(LinearTransformer):
         grid0 = with_positions(coarse0, self.decay)  # (N, h, w, 256)
         grid1 = with_positions(coarse1, self.decay)
         # Linear attention has no notion of rows and columns: cells become tokens (N, h w, 256).
-        flat_masks = None
-        if masks is not None:
-            mask0, mask1 = masks
-            flat_masks = (mask0.flatten(1), mask1.flatten(1))
+        flat_masks = None if masks is None else (masks[0].flatten(1), masks[1].flatten(1))
         cells0 = grid0.flatten(1, 2)
         cells1 = grid1.flatten(1, 2)
         tokens0, tokens1 = super().forward(cells0, cells1, flat_masks)
@@ -44,8 +41,7 @@ class Loftr(SemiDenseNetwork):
     """
 
     def __init__(self, training: Training = Training.OUTDOOR) -> None:
+        indoor = training is Training.INDOOR
         # A wrong encoding loads without an error, and matches become worse.
-        if training is Training.INDOOR:
-            super().__init__(LoftrTransformer(FIXED_DECAY), border=0)
-        else:
-            super().__init__(LoftrTransformer(ORIGINAL_DECAY))
+        decay = FIXED_DECAY if indoor else ORIGINAL_DECAY
+        super().__init__(LoftrTransformer(decay), border=0 if indoor else 2)
