@@ -30,9 +30,9 @@ from mkpc_kaggle.matchers.contract import (
 from mkpc_kaggle.matchers.devices import require_device
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
 from mkpc_kaggle.matchers.failures import FailureKind, failure_kind, reason_of
-from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.setup.assembly import Assembly
 
 ENCODING_CACHE_BYTES = 2 << 30  # on a CPU
 CACHE_SHARE = 0.25  # of a GPU's free memory, for the cached encodings of all workers on it

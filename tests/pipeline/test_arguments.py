@@ -22,9 +22,9 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec
 from mkpc_kaggle.matchers.networks.aliked import Aliked
-from mkpc_kaggle.pipeline import assembly
 from mkpc_kaggle.pipeline.arguments import as_image, intrinsics_of
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
+from mkpc_kaggle.setup import assembly
 
 pytestmark = pytest.mark.usefixtures("nowhere_else")
 
