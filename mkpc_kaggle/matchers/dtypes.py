@@ -21,7 +21,7 @@ def exact_float32() -> Iterator[None]:
         return
     import torch
 
-    cudnn = torch.backends.cudnn
+    cudnn: Any = torch.backends.cudnn
     product = torch.backends.cuda.matmul
     # Since PyTorch 2.9, and before.
     is_new = hasattr(cudnn, "conv")
