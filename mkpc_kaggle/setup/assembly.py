@@ -142,13 +142,13 @@ def assemble(
     :func:`mkpc_kaggle.recipe.with_settings`. Raises :class:`UserError`, also if weights of a
     recipe other than ``auto`` are missing.
     """
-    own = {} if matchers is None else matchers
+    own = dict(matchers or {})
     require_matchers(own)
     directories, files = weights_of(weights)
     store = WeightStore(directories, chosen=files)
     chosen = recipe_of_name(recipe, own)
-    if settings:
-        chosen = with_settings(chosen, settings)
+    if changes := dict(settings):
+        chosen = with_settings(chosen, changes)
     missing = missing_weights(chosen, store, own)
     if missing and recipe != AUTO:
         raise UserError(

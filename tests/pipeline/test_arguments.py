@@ -163,6 +163,7 @@ def test_other_camera_matrices_are_refused_before_any_matching(given):
         ({"weights": {"aliked-n16": "none.pth"}}, UserError, ["aliked-n16", "none.pth", "No such"]),
         ({"device": "gpu"}, UserError, ["'gpu'"]),
         ({"precision": "half"}, ValueError, ["'half'", "Precision"]),
+        ({"settings": [1]}, TypeError, ["sequence"]),
         ({"settings": {"magsac.threshold": "wide"}}, UserError, ["threshold", "'wide'"]),
         ({"settings": {"magsac.threshold": np.ones(2)}}, UserError, ["threshold", "array"]),
         ({"matchers": {"sift": SiftMatcher}}, TypeError, ["'sift' is <class", "instance"]),
