@@ -91,8 +91,7 @@ class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
 
 def semi_dense_spec(name: str, multiple: int) -> MatcherSpec:
     """Return the spec of a network with weights for outdoors and indoors."""
-    slots = (f"{name}-{{training}}",)
-    return MatcherSpec(name, SemiDenseOptions, Colour.GRAY, multiple, slots)
+    return MatcherSpec(name, SemiDenseOptions, Colour.GRAY, multiple, (f"{name}-{{training}}",))
 
 
 def load_semi_dense(
