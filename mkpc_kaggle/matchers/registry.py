@@ -48,9 +48,8 @@ def load_matcher(
 
     Raises :class:`UserError` if its weights are missing or damaged.
     """
-    module = import_module(MATCHERS[name])
     with exact_float32():
-        matcher: Matcher[Any] = module.load(weights, options, placement)
+        matcher: Matcher[Any] = import_module(MATCHERS[name]).load(weights, options, placement)
     return matcher
 
 
