@@ -9,7 +9,6 @@ from benchmarks.gpu.record import Part, Row, SkippedError
 from benchmarks.gpu.setup import Setup
 from benchmarks.gpu.speed import QUICK_RECIPES, RECIPES, Case
 from mkpc_kaggle.recipe import Unit, load_recipe
-from mkpc_kaggle.setup.assembly import CUDA_MINIBATCH
 
 PAIRS = 10_000
 SECONDS = 8.75 * 3600
