@@ -43,8 +43,8 @@ from mkpc_kaggle.geometry.metrics import (
 )
 from mkpc_kaggle.geometry.robust import calibrate, homogeneous
 from mkpc_kaggle.geometry.two_view import cross_matrix
-from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
+from mkpc_kaggle.setup.assembly import assemble
 from mkpc_kaggle.signals import interruptible
 
 # A correct match's maximum sum of both squared epipolar distances, on the planes z = 1.

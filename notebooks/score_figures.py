@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.evaluation.validate import gain_of
 from mkpc_kaggle.geometry.metrics import ROTATION_THRESHOLDS, TRANSLATION_THRESHOLDS
-from mkpc_kaggle.pipeline.drawing import COLOURS, DROPPED, new_figure
+from mkpc_kaggle.pipeline.drawing import new_figure
 from mkpc_kaggle.reporting.figures import plain_axes
 
 if TYPE_CHECKING:
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
     from mkpc_kaggle.evaluation.validate import Validation
 
+# The Okabe-Ito palette, suitable for colour-blind readers.
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7")
+DROPPED = "#999999"
 MARKERS = "osD^vPX"
 DASHES = ("-", "--", "-.", ":")
 PANELS = (  # of draw_errors: kind, unit, thresholds of the mAA, limits of x

@@ -12,7 +12,6 @@ from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.matchers.registry import MATCHERS, spec_of
-from mkpc_kaggle.pipeline.assembly import options_of, slots_of
 from mkpc_kaggle.recipe import (
     Mode,
     Recipe,
@@ -21,6 +20,7 @@ from mkpc_kaggle.recipe import (
     parse_recipe,
     recipe_names,
 )
+from mkpc_kaggle.setup.assembly import options_of, slots_of
 from mkpc_kaggle.weights.manifest import manifest
 
 SIFT = 'units = [{ stage = 1, matcher = "sift", long_side = 640 }]\n'

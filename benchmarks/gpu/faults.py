@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from mkpc_kaggle.matchers.contract import Matcher, Picture, Placement
-from mkpc_kaggle.pipeline.assembly import CUDA_MINIBATCH, Assembly
+from mkpc_kaggle.setup.assembly import CUDA_MINIBATCH, Assembly
 
 EVENTS = "events.jsonl"  # a line for each call of a matcher
 VICTIM = "victim"  # the file that names the pair of the fault

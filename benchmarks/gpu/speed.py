@@ -27,10 +27,10 @@ from mkpc_kaggle.matchers.adapters.sift import SiftMatcher
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.dense import DenseMatcher
 from mkpc_kaggle.matchers.registry import load_matcher, spec_of
-from mkpc_kaggle.pipeline.assembly import CUDA_MINIBATCH
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.stages import CACHE_SHARE, ENCODING_CACHE_BYTES, Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
+from mkpc_kaggle.setup.assembly import CUDA_MINIBATCH
 from mkpc_kaggle.weights import WeightStore
 
 # The most useful recipes first: what follows may not be reached.

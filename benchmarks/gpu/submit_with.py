@@ -16,8 +16,8 @@ from benchmarks.gpu.faults import Fault, FaultyAssembly
 from benchmarks.gpu.seeded import SeededWeights
 from mkpc_kaggle.cli import main, options
 from mkpc_kaggle.matchers.devices import resolve_placement
-from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.recipe import load_recipe
+from mkpc_kaggle.setup.assembly import Assembly, assemble
 
 
 def run(words: list[str]) -> int:

@@ -14,8 +14,8 @@ from mkpc_kaggle.engine.cluster import parse_workers
 from mkpc_kaggle.engine.console import drain, logger, queued
 from mkpc_kaggle.engine.session import Session
 from mkpc_kaggle.errors import UserError, writing
-from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.recipe import parse_setting, split_mode
+from mkpc_kaggle.setup.assembly import Assembly, assemble
 from mkpc_kaggle.signals import Interrupt
 
 RECIPE = """a recipe, or one matcher such as aliked_lightglue (default: auto, every matcher with its weights).

@@ -3,8 +3,8 @@
 import argparse
 
 from mkpc_kaggle.cli import options
-from mkpc_kaggle.pipeline.assembly import fetch_command, listed, missing_weights, recipe_of_name
 from mkpc_kaggle.recipe import Recipe, load_recipe, recipe_names
+from mkpc_kaggle.setup.assembly import fetch_command, listed, missing_weights, recipe_of_name
 from mkpc_kaggle.weights import WeightStore
 
 HELP = """\

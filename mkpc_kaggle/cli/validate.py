@@ -18,8 +18,8 @@ from mkpc_kaggle.evaluation.validate import (
     to_json,
     validate,
 )
-from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
+from mkpc_kaggle.setup.assembly import Assembly
 from mkpc_kaggle.signals import interruptible
 
 HELP = """\

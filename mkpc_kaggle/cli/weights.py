@@ -6,8 +6,8 @@ from pathlib import Path
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.errors import UserError, plural, temporary_directory
-from mkpc_kaggle.pipeline.assembly import slots_of
 from mkpc_kaggle.recipe import load_recipe, recipe_names
+from mkpc_kaggle.setup.assembly import slots_of
 from mkpc_kaggle.weights import WeightFile, WeightStore
 from mkpc_kaggle.weights.fetch import Downloads, preferred
 from mkpc_kaggle.weights.manifest import manifest

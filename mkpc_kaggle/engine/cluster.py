@@ -22,8 +22,8 @@ from mkpc_kaggle.engine.process import EXIT_TIMEOUT_S, ThreadWorker
 from mkpc_kaggle.engine.request import Answer, Cause, Failure
 from mkpc_kaggle.engine.worker import Executor, Maker, MatchRunner, Message, Runner
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.setup.assembly import Assembly
 from mkpc_kaggle.version import __version__
 
 WORKER_FORMS = "a number of processes, ray (this machine's cluster, or a new one for this run), ray://HOST:PORT"

@@ -94,8 +94,7 @@ class Results:
 
     def matches(self, *pairs: str) -> Iterator[PairMatch]:
         """Yield the matches, critical regions and own F of pairs, by id, to plot them."""
-        recipe = self.recipe
-        units = {unit.name: unit for unit in recipe.units}
+        units = {unit.name: unit for unit in self.recipe.units}
         known = self.pairs.set_index("pair")
         with Store.read(self.directory) as store:
             for pair in pairs:
@@ -113,7 +112,7 @@ class Results:
                     crops = crops or (regions_of(regions) if regions else None)
                 F = FALLBACK_FUNDAMENTAL if row["own"] is None else np.reshape(row["own"], (3, 3))
                 estimate = nearest_to(F, found, row["inliers"], row["failure"])
-                yield PairMatch(tuple(found), crops, estimate, mkpc=recipe.mkpc)
+                yield PairMatch(tuple(found), crops, estimate)
 
 
 def nearest_to(F: Matrix3, results: Iterable[UnitResult], count: int, failure: str) -> Estimate:

@@ -32,8 +32,8 @@ from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.errors import open_regular
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.scene.view_graph import BatchImage
+from mkpc_kaggle.setup.assembly import Assembly
 
 # Versions of the algorithms, each in the digests of its kind. With a wrong version, old results would
 # pass as today's, which no later check notices.

@@ -17,8 +17,8 @@ from mkpc_kaggle.cores import available_cores
 from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
 from mkpc_kaggle.engine.request import Answer, Cause, EstimateJob, Failure, Job, Loaded, MatchJob
 from mkpc_kaggle.engine.worker import MatchRunner, estimates_runner, scene_runner
-from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.setup.assembly import Assembly
 
 LISTEN_S = 0.2  # between checks for an interrupt, since a signal does not ring
 # An estimate takes a fraction of a pair's matching on a CPU; on a GPU, the other cores decode images.

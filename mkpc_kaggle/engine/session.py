@@ -39,9 +39,9 @@ from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.recipe import PINHOLES
 from mkpc_kaggle.scene.view_graph import BatchImage
+from mkpc_kaggle.setup.assembly import Assembly
 from mkpc_kaggle.signals import Interrupt
 from mkpc_kaggle.version import __version__
 

@@ -24,7 +24,7 @@ from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry import metrics
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError
-from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.setup.assembly import Assembly
 
 if TYPE_CHECKING:
     from pandas import DataFrame

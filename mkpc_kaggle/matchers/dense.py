@@ -26,23 +26,17 @@ class DenseOptions(TrainedOptions):
 
     matches: int = 5000  # the maximum number of sampled matches of a pair
     threshold: float = 0.05  # certainties above it count as 1
-    passes: int = 0  # 2: first on smaller pictures, then on the unit's; 0: as published
+    passes: int = 1  # 2: first on smaller pictures, then on the unit's
     first_pass: float = 0.625  # scale of the sides in the first of two passes
 
     def __post_init__(self) -> None:
-        check_ranges(self, matches=AT_LEAST_1, threshold=SHARE, passes=Range(0, 2))
+        check_ranges(self, matches=AT_LEAST_1, threshold=SHARE, passes=Range(1, 2))
         check_ranges(self, first_pass=Range(0, 1, "(]"))
-
-    @property
-    def published_passes(self) -> int:
-        """The number of passes that the authors published for this training."""
-        return 1
 
     @property
     def first_scale(self) -> float | None:
         """The scale of the first of two passes; ``None`` for one pass."""
-        passes = self.passes or self.published_passes
-        return self.first_pass if passes == 2 else None
+        return self.first_pass if self.passes == 2 else None
 
 
 class DenseEncoding(NamedTuple):

@@ -21,19 +21,12 @@ def exact_float32() -> Iterator[None]:
         return
     import torch
 
-    cudnn = torch.backends.cudnn
+    cudnn: Any = torch.backends.cudnn
     product = torch.backends.cuda.matmul
-    settings: tuple[Any, ...]
-    exact: Any
-    # The settings, their name and value since PyTorch 2.9, and before.
-    if hasattr(cudnn, "conv"):
-        settings = (cudnn.conv, product)
-        name = "fp32_precision"
-        exact = "ieee"
-    else:
-        settings = (cudnn, product)
-        name = "allow_tf32"
-        exact = False
+    # Since PyTorch 2.9, and before.
+    is_new = hasattr(cudnn, "conv")
+    settings = (cudnn.conv if is_new else cudnn, product)
+    name, exact = ("fp32_precision", "ieee") if is_new else ("allow_tf32", False)
     former = [getattr(setting, name) for setting in settings]
     dtype = torch.get_default_dtype()
     torch.set_default_dtype(torch.float32)

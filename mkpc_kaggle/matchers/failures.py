@@ -40,7 +40,7 @@ def failure_kind(error: BaseException) -> FailureKind:
     """Return the kind of an error that a matcher raised."""
     reason = reason_of(error)
     # First: "CUDA error: out of memory" is no failed device.
-    if isinstance(error, MemoryError) or _OUT_OF_MEMORY.search(reason):
+    if _OUT_OF_MEMORY.search(reason):
         return FailureKind.OUT_OF_MEMORY
     if _DEVICE.search(reason):
         return FailureKind.DEVICE

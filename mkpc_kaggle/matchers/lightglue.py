@@ -10,7 +10,6 @@ from mkpc_kaggle.config import Range, check_ranges
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Placement
 from mkpc_kaggle.matchers.networks.lightglue import (
-    Adaptation,
     LightGlue,
     LightGlueShape,
     normalised,
@@ -43,10 +42,6 @@ class LightGlueOptions(KeypointOptions):
             self, depth_confidence=share, width_confidence=share, filter_threshold=Range(0, 1)
         )
 
-    @property
-    def adaptation(self) -> Adaptation:
-        return Adaptation(self.depth_confidence, self.width_confidence, self.filter_threshold)
-
 
 class LightGlueMatcher(PairwiseMatcher[Keypoints]):
     """LightGlue on an encoder's keypoints. Scores are LightGlue's."""
@@ -66,9 +61,7 @@ class LightGlueMatcher(PairwiseMatcher[Keypoints]):
             _positions(keypoints1),
             keypoints1.descriptors,
         )
-        return matches_of(
-            keypoints0.points, keypoints1.points, found.index0, found.index1, found.scores
-        )
+        return matches_of(keypoints0.points, keypoints1.points, found)
 
 
 def _positions(keypoints: Keypoints) -> Tensor:
@@ -99,7 +92,13 @@ def load_lightglue(
     layers = {int(name.split(".")[1]) for name in tensors if name.startswith("transformers.")}
     shape = replace(shape, layers=1 + max(layers, default=0))
     adapts = any(name.startswith("token_confidence.") for name in tensors)
-    glue = LightGlue(shape, options.adaptation, adapts=adapts)
+    glue = LightGlue(
+        shape,
+        options.depth_confidence,
+        options.width_confidence,
+        options.filter_threshold,
+        adapts=adapts,
+    )
     unused = SURPLUS
     # Without early stopping and pruning only the last layer's assignment is used.
     if not glue.adapts:

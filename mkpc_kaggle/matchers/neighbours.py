@@ -1,13 +1,15 @@
 """Mutual nearest neighbours of descriptors, in blocks of the N x M matrix."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import PairwiseMatcher
-from mkpc_kaggle.matchers.sparse import Keypoints, matches_of
+from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture
+from mkpc_kaggle.matchers.networks.layers import Assignment
+from mkpc_kaggle.matchers.sparse import Encode, Keypoints, matches_of
 
 # On a CPU, a block of 512 x 8,000 similarities fits the cache. A GPU is idle between small blocks.
 BLOCK_ROWS = {"cpu": 512, "cuda": 8192}
@@ -31,13 +33,18 @@ class Neighbours:
 class NeighbourMatcher(PairwiseMatcher[Keypoints]):
     """Mutual nearest neighbours with a distance ratio up to ``ratio``, scored by their cosine."""
 
-    ratio = 1.0
+    def __init__(self, spec: MatcherSpec, encode: Encode, ratio: float) -> None:
+        self.spec = spec
+        self.ratio = ratio
+        self._encode = encode
+
+    def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
+        return self._encode(pictures)
 
     def _match(self, first: Keypoints, second: Keypoints) -> Matches:
         pairs = mutual_neighbours(first.descriptors, second.descriptors, self.ratio)
-        return matches_of(
-            first.points, second.points, pairs.index0, pairs.index1, self._scores(pairs)
-        )
+        found = Assignment(pairs.index0, pairs.index1, self._scores(pairs))
+        return matches_of(first.points, second.points, found)
 
     def _scores(self, pairs: Neighbours) -> Tensor:
         return pairs.similarity
@@ -90,14 +97,9 @@ def _nearest(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         highest.scatter_(1, group[:, None], -1.0)
         second = torch.maximum(inside.amax(dim=1), highest.amax(dim=1))
         similarities.append(best)
-        ratios.append(_distance_ratio(best, second))
+        # Distances of unit vectors are sqrt(2 - 2 s); the ratio of two neighbours at distance 0 is 1.
+        nearest = (1 - best).clamp(min=1e-12)
+        next_nearest = (1 - second).clamp(min=1e-12)
+        ratios.append((nearest / next_nearest).sqrt())
         indices.append(group * GROUP + offset)
     return torch.cat(similarities), torch.cat(ratios), torch.cat(indices)
-
-
-def _distance_ratio(best: Tensor, second: Tensor) -> Tensor:
-    """Return the nearest over the second nearest distance of unit vectors, from their cosines."""
-    # Distances of unit vectors are sqrt(2 - 2 s); the ratio of two neighbours at distance 0 is 1.
-    nearest = (1 - best).clamp(min=1e-12)
-    next_nearest = (1 - second).clamp(min=1e-12)
-    return (nearest / next_nearest).sqrt()

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from mkpc_kaggle.config import SHARE, check_ranges
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size, from_corner
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import (
@@ -28,8 +27,8 @@ from mkpc_kaggle.matchers.sparse import image_batch
 from mkpc_kaggle.weights import WeightStore, load_into
 
 PREFIX = "matcher."  # of parameter names in the published training checkpoints
-# A parameter that only checkpoints with optimal transport have.
-TRANSPORT = "coarse_matching.bin_score"
+# The network computes positions, and the published ASpanFormer does not use its offsets.
+UNUSED = r".*(pos_encoding\.pe|\.sample_offset)$"
 
 
 @dataclass(frozen=True)
@@ -79,22 +78,20 @@ class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
         return encodings
 
     def _match(self, first: SemiDenseEncoding, second: SemiDenseEncoding) -> Matches:
-        mask0 = first.mask
-        mask1 = second.mask
+        masks = (first.mask, second.mask)
         # No masks for pictures without padding: even a mask that is True everywhere can change
         # rounding.
-        is_whole = bool(mask0.all() and mask1.all())
-        found = self._network.match(first.maps, second.maps, None if is_whole else (mask0, mask1))
+        is_whole = bool(masks[0].all() and masks[1].all())
+        found = self._network.match(first.maps, second.maps, None if is_whole else masks)
         # The networks count pixels from the image's corner.
         points0 = from_corner(found.points0.float().cpu().numpy())
         points1 = from_corner(found.points1.float().cpu().numpy())
         return Matches(points0, points1, found.coarse.scores.float().cpu().numpy())
 
 
-def semi_dense_spec(name: str, network: type[SemiDenseNetwork]) -> MatcherSpec:
+def semi_dense_spec(name: str, multiple: int) -> MatcherSpec:
     """Return the spec of a network with weights for outdoors and indoors."""
-    slots = (f"{name}-{{training}}",)
-    return MatcherSpec(name, SemiDenseOptions, Colour.GRAY, network.multiple, slots)
+    return MatcherSpec(name, SemiDenseOptions, Colour.GRAY, multiple, (f"{name}-{{training}}",))
 
 
 def load_semi_dense(
@@ -103,23 +100,11 @@ def load_semi_dense(
     weights: WeightStore,
     options: SemiDenseOptions,
     placement: Placement,
-    *,
-    unused: str = "$^",
 ) -> SemiDenseMatcher:
-    """Load the published checkpoint into a network from ``make``.
-
-    The training wrapper's prefix is removed from names. Names that match ``unused`` are ignored,
-    and so are position tables, which the network computes. Raises :class:`UserError` for weights
-    that were trained with optimal transport.
-    """
+    """Load the published checkpoint into a network from ``make``."""
     (slot,) = spec.slots_for(options)
     tensors = {name.removeprefix(PREFIX): tensor for name, tensor in weights.load(slot).items()}
-    if TRANSPORT in tensors:
-        raise UserError(
-            f"the weights for {slot!r} match by optimal transport, this network by dual softmax: take the file "
-            "trained with it (LoFTR's are called outdoor_ds and indoor_ds_new, not outdoor_ot and indoor_ot)"
-        )
     network = make(options.training)
-    load_into(network, tensors, what=slot, unused=rf".*pos_encoding\.pe$|{unused}")
+    load_into(network, tensors, what=slot, unused=UNUSED)
     network.threshold = options.threshold
     return SemiDenseMatcher(prepared(network, placement), spec, placement.device)

@@ -12,6 +12,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Picture, Placement
 from mkpc_kaggle.matchers.dtypes import check_finite
+from mkpc_kaggle.matchers.networks.layers import Assignment
 from mkpc_kaggle.matchers.networks.placement import autocast
 
 # Images (B, 3, H, W) -> for each image, points (K, 2) in pixels and unit descriptors (K, D).
@@ -55,8 +56,7 @@ class Keypoints:
         upper = points.new_tensor(content) - 0.5
         kept = ((points >= -0.5) & (points < upper)).all(dim=1)
         kept_shapes = [shape[kept] for shape in shapes]
-        scales, orientations = kept_shapes or (None, None)
-        return cls(points[kept], descriptors[kept], content, scales, orientations)
+        return cls(points[kept], descriptors[kept], content, *kept_shapes)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -99,14 +99,12 @@ def library_encoder(
     return keypoint_encoder(detect_in_precision, placement)
 
 
-def matches_of(
-    points0: Tensor, points1: Tensor, index0: Tensor, index1: Tensor, scores: Tensor
-) -> Matches:
-    """Return the matches of point ``index0[i]`` of one picture with ``index1[i]`` of the other."""
+def matches_of(points0: Tensor, points1: Tensor, found: Assignment) -> Matches:
+    """Return the matches of two pictures' points (N, 2) and (M, 2) that an assignment pairs."""
     return Matches(
-        points0[index0].cpu().numpy(),
-        points1[index1].cpu().numpy(),
-        scores.cpu().numpy(),
+        points0[found.index0].cpu().numpy(),
+        points1[found.index1].cpu().numpy(),
+        found.scores.cpu().numpy(),
     )
 
 

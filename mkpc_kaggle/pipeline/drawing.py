@@ -1,4 +1,4 @@
-"""Figures of a pair: matches, clusters and critical regions, in matplotlib."""
+"""Figures of a pair: matches and critical regions, in matplotlib."""
 
 from math import sqrt
 from typing import TYPE_CHECKING, Literal
@@ -10,7 +10,6 @@ from mkpc_kaggle.data.competition import evenly_spread
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Box, View
-from mkpc_kaggle.geometry.critical_region import CriticalRegion, find_clusters
 from mkpc_kaggle.pipeline.pair import PairMatch
 
 if TYPE_CHECKING:
@@ -18,8 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # The Okabe-Ito palette, suitable for colour-blind readers.
-INLIER, OUTLIER, REGION, DROPPED = "#009E73", "#D55E00", "#F0E442", "#999999"
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7")
+INLIER, OUTLIER, REGION = "#009E73", "#D55E00", "#F0E442"
 DPI = 110
 STRIP_HEIGHT_PX = 480
 MAX_STRIP_PX = 2_000_000  # a panorama would otherwise make a picture of many megabytes
@@ -29,19 +27,15 @@ MAX_OUTLIERS = 50
 
 
 def draw_pair(images: tuple[Image, Image], match: PairMatch) -> "Figure":
-    """Draw the matches of all units and the critical regions, and below them the clusters of stage
-    1.
-    """
-    figure = new_figure(12, 9)  # inches: legible on a screen of 1,320 pixels
-    panels = figure.subplot_mosaic([["matches", "matches"], ["0", "1"]])
-    draw_matches(panels["matches"], images, match)
+    """Draw the matches of all units and the critical regions, with the counts as title."""
+    figure = new_figure(12, 5)  # inches: legible on a screen of 1,320 pixels
+    axes = figure.subplots()
+    draw_matches(axes, images, match)
     counts = (
         f"{plural(len(match.matches), 'match')}, {plural(match.estimate.inlier_count, 'inlier')}"
     )
     failure = f"; {match.estimate.failure}" if match.estimate.failure else ""
-    panels["matches"].set_title(f"{counts} (green){failure}", loc="left")
-    for side, image in enumerate(images):
-        _draw_clusters(panels[str(side)], image, match, side)
+    axes.set_title(f"{counts} (green){failure}", loc="left")
     return figure
 
 
@@ -64,14 +58,23 @@ def draw_matches(
     Images are reduced to ``height_px``, if given: matplotlib takes several times as long to do it.
     """
     from matplotlib.collections import LineCollection
+    from matplotlib.patches import Polygon
 
     ends: list[NDArray[np.float64]] = []
     left = 0.0
     for side, points in enumerate((match.matches.points0, match.matches.points1)):
         view = _upright(images[side], height_px)
         width, height = view.content
-        _show(axes, images[side], view, match.regions and match.regions[side], 1 / height, left)
         # (0, 0) is the centre of a pixel, and the corner of the picture
+        extent = (left, left + width / height, 1, 0)
+        axes.imshow(view.render(images[side].pixels), extent=extent)
+        if match.regions:
+            box = match.regions[side].box
+            x = np.array([box.left, box.left, box.right, box.right])
+            y = np.array([box.top, box.bottom, box.bottom, box.top])
+            # A box has borders of pixels, a view maps centres. A view may be turned.
+            corners = (view.from_image(np.column_stack([x, y]) - 0.5) + 0.5) / height + (left, 0)
+            axes.add_patch(Polygon(corners, fill=False, edgecolor=REGION, linewidth=2.5))
         ends.append((view.from_image(points) + 0.5) / height + (left, 0))
         left += width / height
         # A gap between the images, below the lines
@@ -88,56 +91,6 @@ def draw_matches(
         )
         x, y = lines[some].reshape(-1, 2).T
         axes.scatter(x, y, s=5, color=colour, linewidths=0)
-
-
-def _draw_clusters(axes: "Axes", image: Image, match: PairMatch, side: int) -> None:
-    view = _upright(image)
-    _show(axes, image, view, match.regions and match.regions[side])
-    axes.set(xticks=[], yticks=[])
-    if match.regions is None:
-        axes.set_title("no stage 2: no critical region", loc="left")
-        return
-    region = match.regions[side]
-    # Clusters are not stored. The same points give the same clusters as in the run.
-    stage1 = match.matches[match.in_stage(1)]
-    points = stage1.points1 if side else stage1.points0
-    clusters = find_clusters(points, image.size, match.mkpc)
-    shown = view.from_image(points) + 0.5  # (0, 0) is the top-left corner in the figure
-    x, y = shown[~clusters.in_kept].T
-    axes.scatter(x, y, s=8, color=DROPPED, marker="x", linewidths=0.7)
-    for rank, label in enumerate(clusters.kept):
-        x, y = shown[clusters.labels == label].T
-        axes.scatter(x, y, s=8, color=COLOURS[rank % len(COLOURS)], linewidths=0)
-    share = region.box.area / (image.size.width * image.size.height)
-    axes.set_title(
-        f"critical region: {region.reason}, {100 * share:.0f} % of the image\n"
-        f"{region.kept} of {plural(region.clusters, 'cluster')} kept, grey: the other points",
-        loc="left",
-    )
-
-
-def _show(
-    axes: "Axes",
-    image: Image,
-    view: View,
-    region: CriticalRegion | None,
-    scale: float = 1.0,
-    left: float = 0.0,
-) -> None:
-    """Draw a view of an image, from (left, 0) with pixels ``scale`` wide, and its critical region."""
-    from matplotlib.patches import Polygon
-
-    width, height = view.content
-    axes.imshow(view.render(image.pixels), extent=(left, left + scale * width, scale * height, 0))
-    if region is not None:
-        box = region.box
-        x = np.array([box.left, box.left, box.right, box.right])
-        y = np.array([box.top, box.bottom, box.bottom, box.top])
-        # A box has borders of pixels, a view maps centres. A view may be turned.
-        corners = view.from_image(np.column_stack([x, y]) - 0.5) + 0.5
-        axes.add_patch(
-            Polygon(scale * corners + (left, 0), fill=False, edgecolor=REGION, linewidth=2.5)
-        )
 
 
 def _upright(image: Image, height_px: int | None = None) -> View:

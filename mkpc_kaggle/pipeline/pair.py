@@ -1,6 +1,6 @@
 """A pair on its way through the stages: results of units, critical regions, the two-view model."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
-from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig
+from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.crop_need import CropNeed
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
@@ -72,8 +72,6 @@ class PairMatch:
         Width and height, and the focal length by EXIF, of each image, in pixels.
     failure : str
         The image that cannot be read.
-    mkpc : MkpcConfig
-        The settings of MKPC, for ``plot()``.
     scale : float
         The ratio of the scales of both images, known with the regions.
 
@@ -92,7 +90,6 @@ class PairMatch:
     sizes: tuple[Size, ...] = ()
     focals: tuple[float, ...] = ()
     failure: str = ""
-    mkpc: MkpcConfig = field(default_factory=MkpcConfig)
     scale: float = 1.0
 
     @property
@@ -110,18 +107,14 @@ class PairMatch:
         """The matches within MAGSAC's threshold of the model."""
         return self.matches[self.estimate.inliers]
 
-    def plot(self, image0: "ImageSource", image1: "ImageSource") -> "Figure":
-        """Draw the matches, the clusters and the critical regions on the two images.
+    def plot(self, image0: ImageSource, image1: ImageSource) -> "Figure":
+        """Draw the matches and the critical regions on the two images.
 
-        Raises ``ValueError`` for images of another size, and :class:`mkpc_kaggle.errors.UserError`
-        without matplotlib.
+        Raises :class:`mkpc_kaggle.errors.UserError` without matplotlib.
         """
         from mkpc_kaggle.pipeline.drawing import draw_pair  # it draws this class
 
-        images = (as_image(image0), as_image(image1))
-        if self.sizes and tuple(image.size for image in images) != self.sizes:
-            raise ValueError("an image has another size than the matched one")
-        return draw_pair(images, self)
+        return draw_pair((as_image(image0), as_image(image1)), self)
 
     def in_stage(self, stage: int) -> NDArray[np.bool_]:
         """Return the (N,) mask of the ``matches`` that units of this stage found."""

@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from enum import Enum, auto
 from functools import partial
 from typing import Any, Self
 
@@ -31,9 +30,9 @@ from mkpc_kaggle.matchers.contract import (
 from mkpc_kaggle.matchers.devices import require_device
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
 from mkpc_kaggle.matchers.failures import FailureKind, failure_kind, reason_of
-from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.setup.assembly import Assembly
 
 ENCODING_CACHE_BYTES = 2 << 30  # on a CPU
 CACHE_SHARE = 0.25  # of a GPU's free memory, for the cached encodings of all workers on it
@@ -41,13 +40,6 @@ CACHE_SHARE = 0.25  # of a GPU's free memory, for the cached encodings of all wo
 
 class UnloadableError(UserError):
     """Error for a matcher that could not be loaded; ``__cause__`` is the error of its load."""
-
-
-class Retry(Enum):
-    """How to run a minibatch again that has no results yet."""
-
-    IN_FLOAT32 = auto()  # the matcher has switched
-    ON_FEWER_PAIRS = auto()  # memory was not enough for all of them
 
 
 class Pipeline:
@@ -159,35 +151,27 @@ class Pipeline:
             waiting = []
             for index, pair in enumerate(pairs):
                 done = {result.unit for result in pair.results}
-                if unit not in done and (unit.stage == 1 or done.issuperset(before)):
-                    waiting.append(index)
-            if unit.stage == 2:
-                for index in waiting:
-                    pairs[index] = self._with_need(pairs[index], unit)
+                if unit in done or (unit.stage == 2 and not done.issuperset(before)):
+                    continue
+                if unit.stage == 2:
+                    pairs[index] = with_regions(pair, self.recipe, unit)
+                    need = need_of(unit, pairs[index], self.recipe)
+                    if not need.is_needed:
+                        result = UnitResult(unit, Matches.empty(), need=need)
+                        pairs[index] = replace(pairs[index], results=(*pair.results, result))
+                        continue
+                waiting.append(index)
             self._run(unit, pairs, waiting, may_start)
         return pairs
-
-    def _with_need(self, pair: PairMatch, unit: Unit) -> PairMatch:
-        """Return the pair with the regions of a unit of stage 2, and an empty result if it does not need it."""
-        pair = with_regions(pair, self.recipe, unit)
-        need = need_of(unit, pair, self.recipe)
-        if need.is_needed:
-            return pair
-        result = UnitResult(unit, Matches.empty(), need=need)
-        return replace(pair, results=(*pair.results, result))
 
     def _run(
         self,
         unit: Unit,
         pairs: list[PairMatch],
-        chosen: Sequence[int],
+        waiting: Sequence[int],
         may_start: Callable[[Unit, int], bool],
     ) -> None:
-        """Add the unit's results to the chosen pairs that have none, in place."""
-        waiting = []
-        for number in chosen:
-            if unit not in (result.unit for result in pairs[number].results):
-                waiting.append(number)
+        """Add the unit's results to the waiting pairs, in place."""
         while waiting:
             size = min(len(waiting), self._minibatches.get(unit, self.minibatch))
             while size and not may_start(unit, size):
@@ -196,14 +180,14 @@ class Pipeline:
                 return
             numbers = waiting[:size]
             results = self._run_minibatch(unit, [pairs[number] for number in numbers])
-            if isinstance(results, Retry):
+            if results is None:
                 continue
             for number, result in zip(numbers, results, strict=True):
                 pairs[number] = replace(pairs[number], results=(*pairs[number].results, result))
             waiting = waiting[size:]
 
-    def _run_minibatch(self, unit: Unit, pairs: list[PairMatch]) -> list[UnitResult] | Retry:
-        """Return the unit's result on each pair, or how to run the same pairs again."""
+    def _run_minibatch(self, unit: Unit, pairs: list[PairMatch]) -> list[UnitResult] | None:
+        """Return the unit's result on each pair; ``None`` to run again: in float32, or fewer pairs at a time."""
         try:
             return self._match(unit, pairs)
         except Exception as error:
@@ -213,7 +197,7 @@ class Pipeline:
             # A NaN may also come from the pictures; then float32 raises again, and the pair fails.
             is_overflow = isinstance(error, NonFiniteError)
             if is_overflow and self._fall_back_to_float32(unit.matcher, error):
-                return Retry.IN_FLOAT32
+                return None
             if failure is FailureKind.RAISED and unit.matcher in self.raising:
                 error.add_note(f"in {unit.name}")
                 raise
@@ -231,13 +215,13 @@ class Pipeline:
 
         torch.cuda.empty_cache()  # cuBLAS and cuDNN cannot use PyTorch's cached memory
         self._minibatches[unit] = len(pairs) // 2
-        return Retry.ON_FEWER_PAIRS
+        return None
 
     def _run_alone(self, unit: Unit, pair: PairMatch) -> UnitResult:
         """Return the unit's result on a pair."""
         results = self._run_minibatch(unit, [pair])
         # A matcher falls back to float32 once.
-        while isinstance(results, Retry):
+        while results is None:
             results = self._run_minibatch(unit, [pair])
         (result,) = results
         return result
@@ -287,11 +271,6 @@ class Pipeline:
         results = []
         for pair, both, encoding, matches in zip(pairs, views, firsts, found, strict=True):
             in_image = self._unmasked(matches.to_image(*both), pair.images)
-            if unit.matcher in self.raising and len(matches) and not len(in_image):
-                raise ValueError(
-                    f"match of {unit.matcher!r}: all {plural(len(matches), 'match')} were dropped; "
-                    "their points are outside of the pictures, or points or scores are not finite"
-                )
             best = in_image.best(unit.max_matches)
             result = UnitResult(
                 unit,

@@ -13,10 +13,10 @@ from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.arguments import ImageSource, as_image, intrinsics_of
-from mkpc_kaggle.pipeline.assembly import Weights, assemble
 from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.setup.assembly import Weights, assemble
 
 Intrinsics = tuple[Matrix3, Matrix3]
 
@@ -176,5 +176,4 @@ class TwoStageMatcher:
             images=(),
             sizes=tuple(image.size for image in images),
             focals=tuple(image.focal for image in images),
-            mkpc=self.recipe.mkpc,
         )

@@ -18,7 +18,6 @@ from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
-from mkpc_kaggle.pipeline.assembly import Assembly, PathSource, Weights, assemble
 from mkpc_kaggle.recipe import CameraModel, CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reconstruction.folder import Ends, read_folder, read_intrinsics, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import (
@@ -33,6 +32,7 @@ from mkpc_kaggle.reconstruction.outputs import (
 )
 from mkpc_kaggle.reconstruction.pairs import choose_pairs
 from mkpc_kaggle.scene.models import SfmModel
+from mkpc_kaggle.setup.assembly import Assembly, PathSource, Weights, assemble
 from mkpc_kaggle.signals import Interrupt, interruptible
 
 AUTO_RECIPE = "auto"  # the recipe of all matchers whose weights are found

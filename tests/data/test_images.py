@@ -12,6 +12,7 @@ import pycolmap
 import pytest
 from exif_files import set_exif
 from numpy.testing import assert_array_equal
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from mkpc_kaggle.data import images
 from mkpc_kaggle.data.images import (
@@ -70,6 +71,10 @@ def test_a_file_that_is_not_a_picture_has_its_reason(tmp_path):
     (tmp_path / "device.png").symlink_to("/dev/zero")  # it never ends
     assert reason(tmp_path / "empty.png") == "the file is empty"
     assert "not a picture" in reason(tmp_path / "text.png")
+    bands = ImageFileDirectory_v2()
+    bands.update({0x0102: (16,) * 5, 0x0115: 5})
+    (tmp_path / "bands.tif").write_bytes(b"II*\0\x08\0\0\0" + bands.tobytes(8))
+    assert reason(tmp_path / "bands.tif").startswith("a TIFF file of 5 channels of 16 bits; ")
     # The limit is 32 : 1.
     long = "300 x 3 pixels: one side is more than 32 times the other"
     assert reason(write(tmp_path / "line.png", noise(3, 300))) == long

@@ -21,10 +21,10 @@ from mkpc_kaggle.engine.request import Ending, SceneJob
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.engine.worker import compute_scene
-from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.candidates import ALL_UNITS, SUPPORTED
 from mkpc_kaggle.scene.sfm import Solution
+from mkpc_kaggle.setup.assembly import assemble
 from mkpc_kaggle.signals import Interrupt
 
 FIRST, _, LAST = (unit.name for unit in THREE_UNITS.units)

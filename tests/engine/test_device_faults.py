@@ -30,9 +30,9 @@ from mkpc_kaggle.engine.places import Place
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.failures import DeviceError, FailureKind, failure_kind, reason_of
-from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.setup.assembly import Assembly, assemble
 
 COUNT = 12
 

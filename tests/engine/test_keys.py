@@ -9,10 +9,10 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.contract import MatcherSpec
-from mkpc_kaggle.pipeline import assembly
-from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.recipe import SceneConfig, Unit, load_recipe
 from mkpc_kaggle.scene.view_graph import BatchImage
+from mkpc_kaggle.setup import assembly
+from mkpc_kaggle.setup.assembly import Assembly, assemble
 
 CLASSICAL = load_recipe("classical")
 

@@ -21,7 +21,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.setup.assembly import Assembly
 
 TESTS = Path(__file__).parents[1]
 # What machines can import

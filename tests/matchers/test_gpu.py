@@ -21,10 +21,10 @@ from mkpc_kaggle.matchers.devices import (
 )
 from mkpc_kaggle.matchers.dtypes import exact_float32
 from mkpc_kaggle.matchers.failures import DeviceError
-from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.setup.assembly import assemble
 
 UNIT = Unit(1, "own", 64)
 RECIPE = Recipe((UNIT,))

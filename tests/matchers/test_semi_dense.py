@@ -5,16 +5,12 @@ checkpoints.
 import numpy as np
 import pytest
 import torch
-from checkpoints import PublicFile, store_of, wrapped
 from light_matchers import MATCHERS
 from pictures import picture
 
-from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.matchers.adapters import loftr
 from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks.adaptive_span import CELLS_AT_ONCE, span_attention
 from mkpc_kaggle.matchers.networks.coarse_matching import coarse_matches
-from mkpc_kaggle.matchers.networks.loftr import Loftr
 
 
 @pytest.mark.parametrize("held", [0, 2**20])
@@ -58,19 +54,6 @@ def test_span_attention_in_chunks_is_that_of_the_whole(monkeypatch):
             patch.setitem(CELLS_AT_ONCE, "cpu", 5)
             in_chunks = span_attention(q, k, v, samples, 2, mask)
             torch.testing.assert_close(in_chunks, whole, rtol=1e-4, atol=1e-5)
-
-
-def test_weights_with_optimal_transport_are_refused_with_what_to_take_instead(tmp_path):
-    # LoFTR also publishes weights for optimal transport, which this entry reveals.
-    surplus = {"coarse_matching.bin_score": torch.ones(())}
-
-    def with_surplus(state):
-        return wrapped(state | surplus)
-
-    file = PublicFile("x.ckpt", "loftr", "loftr-outdoor", "loftr", Loftr, with_surplus)
-    store = store_of(tmp_path, [file])
-    with pytest.raises(UserError, match=r"'loftr-outdoor' match by optimal transport.*outdoor_ds"):
-        loftr.load(store, loftr.SPEC.options(), Placement())
 
 
 @pytest.mark.parametrize("name", ["loftr", "quadtree", "aspanformer"])

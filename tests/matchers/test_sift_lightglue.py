@@ -12,14 +12,14 @@ from pictures import as_picture, match_one, picture
 from mkpc_kaggle.matchers.adapters.sift_lightglue import SHAPE, SPEC, sift_encoder
 from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher
-from mkpc_kaggle.matchers.networks.lightglue import Adaptation, LightGlue
+from mkpc_kaggle.matchers.networks.lightglue import LightGlue
 
 PICTURE = picture(130, 171, channels=1)
 
 
 def seeded_network() -> LightGlue:
     """LightGlue with the weights of the golden vectors."""
-    glue = LightGlue(SHAPE, Adaptation(depth=-1, width=-1))
+    glue = LightGlue(SHAPE, depth=-1, width=-1)
     seeded = {}
     for name, tensor in glue.state_dict().items():
         seeded[name] = seeded_tensor(name, tuple(tensor.shape))

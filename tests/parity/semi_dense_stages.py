@@ -17,10 +17,11 @@ from golden import (
     standin_state,
 )
 
+from mkpc_kaggle.matchers.adapters.aspanformer import SPEC
 from mkpc_kaggle.matchers.contract import Training
-from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
+from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer, AspanTransformer
 from mkpc_kaggle.matchers.networks.coarse_matching import Cells, half_log_confidences
-from mkpc_kaggle.matchers.networks.fine_matching import cell_points
+from mkpc_kaggle.matchers.networks.fine_matching import COARSE_STRIDE, cell_points
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 
@@ -112,23 +113,27 @@ def loftr_stages(network, case, tolerances):
     yield from compared(values, golden, tolerances)
 
 
-class Evaluated(AspanFormer):
-    """As in a published evaluation: one scale (y, x) for positions, the global level of a size
-    (rows, columns).
+class Evaluated(AspanTransformer):
+    """As in a published evaluation: one scale for positions, the global level of a size (rows,
+    columns).
     """
 
-    def __init__(self, scale, coarsest, training=Training.OUTDOOR):
-        super().__init__(training)
+    def __init__(self, scale, coarsest):
+        super().__init__(None)
         self.scale = scale
         self.coarsest = coarsest
 
     def side(self, coarse, mask):
-        rows = coarse.shape[2] // self.coarsest[0]
-        columns = coarse.shape[3] // self.coarsest[1]
+        height, width = coarse.shape[2:]
+        self.train_size = (self.scale * COARSE_STRIDE * height, self.scale * COARSE_STRIDE * width)
+        rows, columns = height // self.coarsest[0], width // self.coarsest[1]
         return replace(super().side(coarse, mask), factor=(rows, columns))
 
-    def position_scale(self, height, width):
-        return self.scale
+
+def evaluated(scale, coarsest, training=Training.OUTDOOR):
+    network = AspanFormer(training)
+    network.loftr_coarse = Evaluated(scale, coarsest)
+    return network
 
 
 @cache
@@ -161,7 +166,7 @@ def aspanformer_stages(case, make):
     originals = [golden[f"image{side}"] for side in (0, 1)]
     images = []
     for image in originals:  # as in the evaluation: sides rounded down, bilinear, not antialiased
-        size = [side // AspanFormer.multiple * AspanFormer.multiple for side in image.shape[2:]]
+        size = [side // SPEC.multiple * SPEC.multiple for side in image.shape[2:]]
         images.append(torch.nn.functional.interpolate(image, size=size, mode="bilinear"))
     masks, scales = masks_and_scales(golden)
     coarse_scales = None
@@ -189,12 +194,12 @@ def aspanformer_stages(case, make):
     yield from compared(values, golden, ASPANFORMER)
 
 
-MEGADEPTH = (832 / 1152, 832 / 1152)
+MEGADEPTH = 832 / 1152
 ASPANFORMERS = {
     "outdoor_online": AspanFormer,
     "outdoor_online_resize": AspanFormer,
-    "outdoor_padded_batch": lambda: Evaluated(MEGADEPTH, (7, 7)),
-    "indoor_direct": lambda: Evaluated((1.0, 1.0), (4, 3), Training.INDOOR),
+    "outdoor_padded_batch": lambda: evaluated(MEGADEPTH, (7, 7)),
+    "indoor_direct": lambda: evaluated(1.0, (4, 3), Training.INDOOR),
 }
 FAMILY = (
     (Loftr, ("same_size", "diff_size", "masked_batch", "no_match"), LOFTR),

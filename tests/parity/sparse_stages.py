@@ -2,12 +2,14 @@
 
 import json
 from functools import partial
+from unittest.mock import patch
 
 import torch
 from golden import Stage, compared, golden_arrays, ready, recorded, standin_state
 from torch.nn import functional
 
 from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.matchers.networks import superpoint
 from mkpc_kaggle.matchers.networks.layers import mutual_matches
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue, log_optimal_transport
 from mkpc_kaggle.matchers.networks.superpoint import (
@@ -33,7 +35,7 @@ def superpoint_stages(case):
     golden = golden_arrays("superpoint", case)
     options = json.loads(golden["config"])
     image = golden["image"][None, None].float() / 255
-    options["border"] = options.pop("remove_borders")
+    border = options.pop("remove_borders")
     del options["descriptor_dim"]
     network = ready(SuperPoint(**options), standin_state("superpoint"))
     features = network.features(image)
@@ -41,7 +43,8 @@ def superpoint_stages(case):
     field = network.descriptor_field(features)
     scores = score_map(logits)
     suppressed = suppress_non_maxima(scores, network.nms_radius)
-    (found,) = network(image)
+    with patch.object(superpoint, "BORDER", border):
+        (found,) = network(image)
     got = {
         "conv4b_relu": features[0],
         "logits": logits[0],

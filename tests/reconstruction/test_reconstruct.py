@@ -28,10 +28,10 @@ from mkpc_kaggle import results
 from mkpc_kaggle.data.images import TURNS
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
-from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import CameraModel, Recipe, SceneConfig, Unit
 from mkpc_kaggle.reconstruction.run import Models, for_cameras, reconstruct
 from mkpc_kaggle.scene.models import SfmModel
+from mkpc_kaggle.setup.assembly import assemble
 
 PAGES = {"report.html"}  # it tells of times
 RECIPE = for_cameras(Recipe((Unit(1, "synthetic", SIZE.width),), magsac=QUICK))

@@ -21,7 +21,7 @@ from mkpc_kaggle.matchers.networks.loma import Loma, Variant
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
-from mkpc_kaggle.pipeline import assembly
+from mkpc_kaggle.setup import assembly
 from mkpc_kaggle.weights import WeightFile, WeightStore
 
 

@@ -25,11 +25,11 @@ from mkpc_kaggle.engine.worker import MatchRunner, compute_scene
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Picture
-from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, SfmModel
 from mkpc_kaggle.scene.sfm import Solution
+from mkpc_kaggle.setup.assembly import Assembly
 
 BROKEN = "CUDA error: an illegal memory access was encountered"
 ASSERTED = "CUDA error: device-side assert triggered"

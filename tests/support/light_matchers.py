@@ -15,22 +15,24 @@ from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers.adapters import (
+    aliked,
     aliked_lightglue,
     dkm,
     roma,
     sift_lightglue,
     xfeat_lighterglue,
 )
-from mkpc_kaggle.matchers.adapters.aliked import AlikedMatcher, aliked_encoder
+from mkpc_kaggle.matchers.adapters.aliked import aliked_encoder
 from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.adapters.superglue import SuperGlueMatcher
 from mkpc_kaggle.matchers.contract import Colour, Picture, Placement
 from mkpc_kaggle.matchers.dense import DenseMatcher, DenseOptions
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher
+from mkpc_kaggle.matchers.neighbours import NeighbourMatcher
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dkm import DKM
-from mkpc_kaggle.matchers.networks.lightglue import Adaptation, LightGlue, LightGlueShape
+from mkpc_kaggle.matchers.networks.lightglue import LightGlue, LightGlueShape
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant
 from mkpc_kaggle.matchers.networks.placement import prepared
@@ -86,8 +88,8 @@ def loma_matcher(placement: Placement) -> LomaAdapter:
     return LomaAdapter(ours(placement, "loma", Loma, Variant.B128), options, placement.device)
 
 
-def aliked_matcher(placement: Placement, keypoints: int = 200) -> AlikedMatcher:
-    return AlikedMatcher(aliked_keypoints(placement, keypoints)[0])
+def aliked_matcher(placement: Placement, keypoints: int = 200) -> NeighbourMatcher:
+    return NeighbourMatcher(aliked.SPEC, aliked_keypoints(placement, keypoints)[0], ratio=1.0)
 
 
 Keypoints = tuple[Encode, LightGlueShape]  # and the shape of LightGlue for them
@@ -122,8 +124,7 @@ def lightglue_matcher(
 ) -> LightGlueMatcher:
     encode, shape = KEYPOINTS[name](placement, keypoints)
     # All layers and keypoints: what untrained weights would drop is chance.
-    every = Adaptation(depth=-1, width=-1, threshold=threshold)
-    network = unprepared("lightglue", LightGlue, replace(shape, layers=layers), every)
+    network = unprepared("lightglue", LightGlue, replace(shape, layers=layers), -1, -1, threshold)
     return LightGlueMatcher(spec_of(name, "test"), encode, network, placement)
 
 

@@ -21,8 +21,8 @@ from mkpc_kaggle.engine.session import Session, run_pairs, submit
 from mkpc_kaggle.geometry.coordinates import Size, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
-from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.setup.assembly import assemble
 from mkpc_kaggle.signals import Interrupt
 
 

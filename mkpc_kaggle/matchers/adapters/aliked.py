@@ -1,15 +1,14 @@
 """ALIKED keypoints (Zhao et al. 2023) with mutual nearest neighbours."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
 from mkpc_kaggle.config import SHARE, check_ranges
-from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement, Precision
+from mkpc_kaggle.matchers.contract import MatcherSpec, Placement, Precision
 from mkpc_kaggle.matchers.neighbours import NeighbourMatcher
 from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name
 from mkpc_kaggle.matchers.networks.placement import prepared
-from mkpc_kaggle.matchers.sparse import Encode, KeypointOptions, Keypoints, keypoint_encoder
+from mkpc_kaggle.matchers.sparse import Encode, KeypointOptions, keypoint_encoder
 from mkpc_kaggle.weights import WeightStore, load_into
 
 
@@ -21,8 +20,6 @@ class AlikedVariant(StrEnum):
     N32 = "n32"
 
 
-# Points around a keypoint at which its descriptor is read.
-POSITIONS = {AlikedVariant.N16: 16, AlikedVariant.N16ROT: 16, AlikedVariant.N32: 32}
 SLOT = "aliked-{variant}"
 
 
@@ -41,25 +38,12 @@ class AlikedOptions(KeypointOptions):
 SPEC = MatcherSpec("aliked", AlikedOptions, multiple=32, slots=(SLOT,))
 
 
-class AlikedMatcher(NeighbourMatcher):
-    """ALIKED; a match's score is the cosine of its two descriptors."""
-
-    spec = SPEC
-
-    def __init__(self, encode: Encode, ratio: float = 1.0) -> None:
-        self._encode = encode
-        self.ratio = ratio
-
-    def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
-        return self._encode(pictures)
-
-
 def load_encoder(
     weights: WeightStore, features: int, variant: AlikedVariant, placement: Placement
 ) -> Encode:
     """Load ALIKED's encoder, which all matchers of ALIKED keypoints share."""
     slot = SLOT.format(variant=variant)
-    network = Aliked(features, POSITIONS[variant])
+    network = Aliked(features, positions=32 if variant is AlikedVariant.N32 else 16)
     tensors = {own_name(name): tensor for name, tensor in weights.load(slot).items()}
     load_into(network, tensors, what=slot)
     return aliked_encoder(network, placement)
@@ -72,6 +56,6 @@ def aliked_encoder(network: Aliked, placement: Placement) -> Encode:
     return keypoint_encoder(prepared(network, in_float32), in_float32)
 
 
-def load(weights: WeightStore, options: AlikedOptions, placement: Placement) -> AlikedMatcher:
+def load(weights: WeightStore, options: AlikedOptions, placement: Placement) -> NeighbourMatcher:
     encode = load_encoder(weights, options.features, options.variant, placement)
-    return AlikedMatcher(encode, options.ratio)
+    return NeighbourMatcher(SPEC, encode, options.ratio)

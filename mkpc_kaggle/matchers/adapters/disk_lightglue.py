@@ -9,7 +9,7 @@ from torch import Tensor
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, load_lightglue
 from mkpc_kaggle.matchers.networks.lightglue import LightGlueShape
-from mkpc_kaggle.matchers.sparse import Encode, library_encoder
+from mkpc_kaggle.matchers.sparse import library_encoder
 from mkpc_kaggle.weights import WeightStore, load_into
 
 SHAPE = LightGlueShape(descriptor=128)
@@ -22,17 +22,13 @@ SPEC = MatcherSpec(
 )
 
 
-def disk_encoder(network: DISK, features: int, placement: Placement) -> Encode:
-    """Return the encoder of a loaded network, with up to ``features`` keypoints per picture."""
-
-    def detect(images: Tensor) -> list[tuple[Tensor, Tensor]]:
-        return [(each.keypoints, each.descriptors) for each in network(images, n=features)]
-
-    return library_encoder("disk", network, network.unet, detect, placement)
-
-
 def load(weights: WeightStore, options: LightGlueOptions, placement: Placement) -> LightGlueMatcher:
     network = DISK()
     load_into(network, weights.load("disk"), what="disk")
-    encode = disk_encoder(network, options.features, placement)
+
+    def detect(images: Tensor) -> list[tuple[Tensor, Tensor]]:
+        found = network(images, n=options.features)
+        return [(each.keypoints, each.descriptors) for each in found]
+
+    encode = library_encoder("disk", network, network.unet, detect, placement)
     return load_lightglue(SPEC, encode, weights, options, placement, SHAPE)

@@ -5,5 +5,5 @@ from functools import partial
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.semi_dense import load_semi_dense, semi_dense_spec
 
-SPEC = semi_dense_spec("loftr", Loftr)
+SPEC = semi_dense_spec("loftr", multiple=8)
 load = partial(load_semi_dense, SPEC, Loftr)

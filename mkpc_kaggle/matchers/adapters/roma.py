@@ -11,20 +11,19 @@ from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.networks.roma import RoMa
 from mkpc_kaggle.weights import WeightStore, load_into
 
-# Published: passes at 560 x 560 and 864 x 864, as in a stretched unit of 864 x 864; indoors one at
-# 560 x 560.
-PUBLISHED_PASSES = {Training.OUTDOOR: 2, Training.INDOOR: 1}
-
 
 @dataclass(frozen=True)
 class RomaOptions(DenseOptions):
     """The options of a dense matcher, with the defaults of RoMa's publication."""
 
+    # Passes at 560 x 560 and 864 x 864, as in a stretched unit of 864 x 864; indoors one at 560 x 560
+    passes: int = 0  # 0: as published
     first_pass: float = 0.648
 
-    @property
-    def published_passes(self) -> int:
-        return PUBLISHED_PASSES[self.training]
+    def __post_init__(self) -> None:
+        if not self.passes:
+            object.__setattr__(self, "passes", 1 if self.training is Training.INDOOR else 2)
+        super().__post_init__()
 
 
 SPEC = MatcherSpec("roma", RomaOptions, slots=("roma-{training}", "dinov2-vitl14"))

@@ -43,12 +43,8 @@ Detected = tuple[Sequence[cv2.KeyPoint], NDArray[np.float32]]
 class SiftMatcher(NeighbourMatcher):
     """OpenCV's SIFT. A match's score is one minus its distance ratio."""
 
-    spec = SPEC
-
     def __init__(self, options: SiftOptions, device: str) -> None:
-        self.ratio = options.ratio
-        self.device = device
-        self._detector = partial(
+        detector = partial(
             cv2.SIFT_create,  # type: ignore[attr-defined]  # missing in OpenCV's stubs
             options.features,
             contrastThreshold=options.contrast_threshold,
@@ -56,22 +52,19 @@ class SiftMatcher(NeighbourMatcher):
             enable_precise_upscale=True,
         )
 
-    def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
-        detected = detected_in(pictures, self._detector)
-        return [
-            self._keypoints(*found, picture)
-            for found, picture in zip(detected, pictures, strict=True)
-        ]
+        def keypoints_of(detection: Detected, picture: Picture) -> Keypoints:
+            found, descriptors = detection
+            points = np.array([keypoint.pt for keypoint in found], np.float32).reshape(-1, 2)
+            return Keypoints.on_content(
+                torch.from_numpy(points).to(device),
+                torch.from_numpy(root_sift(descriptors)).to(device),
+                picture.content,
+            )
 
-    def _keypoints(
-        self, found: Sequence[cv2.KeyPoint], descriptors: NDArray[np.float32], picture: Picture
-    ) -> Keypoints:
-        points = np.array([keypoint.pt for keypoint in found], np.float32).reshape(-1, 2)
-        return Keypoints.on_content(
-            torch.from_numpy(points).to(self.device),
-            torch.from_numpy(root_sift(descriptors)).to(self.device),
-            picture.content,
-        )
+        def encode(pictures: Sequence[Picture]) -> list[Keypoints]:
+            return list(map(keypoints_of, detected_in(pictures, detector), pictures))
+
+        super().__init__(SPEC, encode, options.ratio)
 
     def _scores(self, pairs: Neighbours) -> Tensor:
         return 1 - pairs.ratio

@@ -66,9 +66,7 @@ class SuperGlueMatcher(PairwiseMatcher[SuperPointKeypoints]):
 
     def _match(self, keypoints0: SuperPointKeypoints, keypoints1: SuperPointKeypoints) -> Matches:
         found = self._superglue(keypoints0, keypoints1)
-        return matches_of(
-            keypoints0.points, keypoints1.points, found.index0, found.index1, found.scores
-        )
+        return matches_of(keypoints0.points, keypoints1.points, found)
 
 
 def load(weights: WeightStore, options: SuperGlueOptions, placement: Placement) -> SuperGlueMatcher:

@@ -13,7 +13,7 @@ from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, l
 from mkpc_kaggle.matchers.networks.lightglue import LightGlueShape
 from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
-from mkpc_kaggle.matchers.sparse import Encode, keypoint_encoder
+from mkpc_kaggle.matchers.sparse import keypoint_encoder
 from mkpc_kaggle.weights import WeightStore, load_into
 
 
@@ -42,19 +42,15 @@ SPEC = MatcherSpec(
 )
 
 
-def superpoint_encoder(network: SuperPoint, placement: Placement) -> Encode:
-    """Return the encoder of a loaded network."""
-
-    def detect(images: Tensor) -> list[tuple[Tensor, Tensor]]:
-        return [(each.points, each.descriptors) for each in network(images)]
-
-    return keypoint_encoder(detect, placement)
-
-
 def load(
     weights: WeightStore, options: SuperPointLightGlueOptions, placement: Placement
 ) -> LightGlueMatcher:
     network = SuperPoint(options.nms_radius, options.keypoint_threshold, options.features)
     load_into(network, weights.load("superpoint"), what="superpoint")
-    encode = superpoint_encoder(prepared(network, placement), placement)
+    on_device = prepared(network, placement)
+
+    def detect(images: Tensor) -> list[tuple[Tensor, Tensor]]:
+        return [(each.points, each.descriptors) for each in on_device(images)]
+
+    encode = keypoint_encoder(detect, placement)
     return load_lightglue(SPEC, encode, weights, options, placement, SHAPE)

@@ -25,9 +25,8 @@ from mkpc_kaggle.matchers.networks.layers import ExactConv1d, resize
 from mkpc_kaggle.matchers.networks.linear_attention import MaskPair
 from mkpc_kaggle.matchers.networks.position import FIXED_DECAY, sine_positions
 from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
-from mkpc_kaggle.matchers.networks.semi_dense import SemiDenseNetwork
+from mkpc_kaggle.matchers.networks.semi_dense import HEADS, SemiDenseNetwork
 
-HEADS = 8
 FLOW = 128  # channels of the flow feature, and of the projected positions
 INITIAL_LAYERS = 2  # of the initial stage
 BLOCKS = 4  # after it
@@ -286,19 +285,26 @@ class AspanBlock(CrossLayer):
 
 
 class AspanTransformer(nn.Module):
-    """The coarse transformer; every layer updates both images at once."""
+    """The coarse transformer; every layer updates both images at once.
 
-    def __init__(self) -> None:
+    The positions of every image are stretched to ``train_size`` (height, width).
+    """
+
+    def __init__(self, train_size: tuple[int, int]) -> None:
         super().__init__()
+        self.train_size = train_size
         self.pos_transform = nn.Conv2d(TOP, FLOW, 1, bias=False)
         self.ini_layer = InitialStage()
         self.layers = nn.ModuleList(AspanBlock(last=index == BLOCKS - 1) for index in range(BLOCKS))
         # The weights of 3x3 convolutions have the memory layout of the grids.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
-    def forward(self, side0: Side, side1: Side) -> tuple[Tensor, Tensor]:
-        """Return the visual features of both images, each (N, h, w, 256)."""
-        side0, side1 = self.ini_layer(side0, side1)
+    def forward(
+        self, coarse0: Tensor, coarse1: Tensor, masks: MaskPair | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Map (N, 256, h, w) of both images to their visual features (N, h, w, 256)."""
+        mask0, mask1 = masks or (None, None)
+        side0, side1 = self.ini_layer(self.side(coarse0, mask0), self.side(coarse1, mask1))
         for block in self.layers:
             updated0 = block(side0, side1)
             updated1 = block(side1, side0)  # from side0 before its update
@@ -306,55 +312,30 @@ class AspanTransformer(nn.Module):
             side1 = updated1
         return side0.visual, side1.visual
 
-
-class AspanFormer(SemiDenseNetwork):
-    """ASpanFormer. Sides are multiples of 32; the two images may differ in size.
-
-    The positions of every image are stretched to ``train_size`` (height, width). Indoor weights
-    were published for 480 x 640 only, without a border, with unscaled positions and a global level
-    of 15 x 20 cells. At this size our scaling and pooling are the same.
-    """
-
-    multiple = 32
-    loftr_coarse: AspanTransformer
-
-    def __init__(self, training: Training = Training.OUTDOOR) -> None:
-        super().__init__(AspanTransformer())
-        self.train_size = (832, 832)
-        if training is Training.INDOOR:
-            self.train_size = (480, 640)
-            self.border = 0
-        self.coarse_matching = nn.ParameterDict({"temperature": torch.tensor(10.0)})
-        self.eval().requires_grad_(False)
-
-    @property
-    def similarity_scale(self) -> Tensor:
-        return self.coarse_matching.get_parameter("temperature") / TOP
-
-    def transform(
-        self, coarse0: Tensor, coarse1: Tensor, masks: MaskPair | None = None
-    ) -> tuple[Tensor, Tensor]:
-        mask0, mask1 = masks or (None, None)
-        grid0, grid1 = self.loftr_coarse(self.side(coarse0, mask0), self.side(coarse1, mask1))
-        return grid0, grid1
-
     def side(self, coarse: Tensor, mask: Tensor | None) -> Side:
-        """Return an image's transformer input: its coarse map (N, 256, h, w) plus positions."""
+        """Return an image's first state: its coarse map (N, 256, h, w) plus positions."""
         grid = as_grid(coarse)
         height, width = grid.shape[1:3]
-        scale = self.position_scale(height, width)
+        # Each axis has its own factor, as in the published code's online mode.
+        train_height, train_width = self.train_size
+        scale = (train_height / (COARSE_STRIDE * height), train_width / (COARSE_STRIDE * width))
         positions = sine_positions(height, width, FIXED_DECAY, scale, grid.device)
         positions = positions[None]  # (1, h, w, 256)
         # Contiguous, because attention reads the grid as tokens by ``view``.
         visual = (grid + positions).contiguous()
-        projected = pointwise(self.loftr_coarse.pos_transform, positions)  # (1, h, w, 128)
+        projected = pointwise(self.pos_transform, positions)  # (1, h, w, 128)
         flow = visual.new_empty(0)  # from the initial stage on
         return Side(visual, flow, projected, POOLING, mask)
 
-    def position_scale(self, height: int, width: int) -> tuple[float, float]:
-        """Return the factors (y, x) that stretch a coarse map's positions to ``train_size``."""
-        # Each axis has its own factor, as in the published code's online mode.
-        train_height, train_width = self.train_size
-        scale_y = train_height / (COARSE_STRIDE * height)
-        scale_x = train_width / (COARSE_STRIDE * width)
-        return scale_y, scale_x
+
+class AspanFormer(SemiDenseNetwork):
+    """ASpanFormer. Sides are multiples of 32; the two images may differ in size.
+
+    Indoor weights were published for 480 x 640 only, without a border, with unscaled positions and
+    a global level of 15 x 20 cells. At this size our scaling and pooling are the same.
+    """
+
+    def __init__(self, training: Training = Training.OUTDOOR) -> None:
+        indoor = training is Training.INDOOR
+        transformer = AspanTransformer((480, 640) if indoor else (832, 832))
+        super().__init__(transformer, 0 if indoor else 2, learned_temperature=True)

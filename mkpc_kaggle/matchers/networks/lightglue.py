@@ -42,20 +42,6 @@ class LightGlueShape:
     positions: int = 2
 
 
-@dataclass(frozen=True)
-class Adaptation:
-    """Settings of early stopping and pruning (section 3.3 of the paper), and of matches.
-
-    Stop after a layer if more than the share ``depth`` of keypoints is confident. Drop confident
-    keypoints that match with a probability of at most 1 - ``width``. Negative: never. Matches score
-    above ``threshold``.
-    """
-
-    depth: float = 0.95
-    width: float = 0.99
-    threshold: float = 0.1
-
-
 class RotaryEmbedding(nn.Module):
     """Rotations of pairs of channels by angles that are linear in a keypoint's position."""
 
@@ -195,32 +181,45 @@ class MatchAssignment(nn.Module):
 
 
 class LightGlue(nn.Module):
-    """LightGlue of any published shape. Without ``adapts``, all layers run on all keypoints.
+    """LightGlue of any published shape, with early stopping and pruning (section 3.3 of the paper).
 
-    Some checkpoints have only the last layer's assignment and no confidences; they cannot adapt.
+    Stop after a layer if more than the share ``depth`` of keypoints is confident. Drop confident
+    keypoints that match with a probability of at most 1 - ``width``. Negative, or without
+    ``adapts``: never; some checkpoints have only the last layer's assignment and no confidences.
+    Matches score above ``threshold``.
     """
 
     def __init__(
-        self, shape: LightGlueShape, adaptation: Adaptation | None = None, *, adapts: bool = True
+        self,
+        shape: LightGlueShape,
+        depth: float = 0.95,
+        width: float = 0.99,
+        threshold: float = 0.1,
+        *,
+        adapts: bool = True,
     ) -> None:
         super().__init__()
-        width = shape.width
+        channels = shape.width
         heads = shape.heads
         layers = shape.layers
-        self.adaptation = adaptation or Adaptation()
-        self.adapts = adapts and max(self.adaptation.depth, self.adaptation.width) > 0
-        is_identity = shape.descriptor == width
-        self.input_proj = nn.Identity() if is_identity else Linear(shape.descriptor, width)
-        self.posenc = RotaryEmbedding(shape.positions, width // heads)
-        self.transformers = nn.ModuleList(TransformerLayer(width, heads) for _ in range(layers))
+        self.depth = depth
+        self.width = width
+        self.threshold = threshold
+        self.adapts = adapts and max(depth, width) > 0
+        is_identity = shape.descriptor == channels
+        self.input_proj = nn.Identity() if is_identity else Linear(shape.descriptor, channels)
+        self.posenc = RotaryEmbedding(shape.positions, channels // heads)
+        self.transformers = nn.ModuleList(TransformerLayer(channels, heads) for _ in range(layers))
         # A run that stops early needs the assignment of the layer at which it stops; pruning needs
         # each layer's matchability.
         assignments = range(layers) if self.adapts else [layers - 1]
-        self.log_assignment = nn.ModuleDict({str(i): MatchAssignment(width) for i in assignments})
+        self.log_assignment = nn.ModuleDict(
+            {str(i): MatchAssignment(channels) for i in assignments}
+        )
         # After the last layer nothing is decided, so it has no confidence.
         self.token_confidence = nn.ModuleList()
         for _ in range(layers - 1 if self.adapts else 0):
-            confidence = nn.Sequential(ExactLinear(width, 1))
+            confidence = nn.Sequential(ExactLinear(channels, 1))
             self.token_confidence.append(nn.ModuleDict({"token": confidence}))
         self.eval().requires_grad_(False)
 
@@ -259,7 +258,7 @@ class LightGlue(nn.Module):
                     return Assignment.empty(x.device)
         scores = self.assignment(last)(x, n0)
         check_finite("scores of lightglue", scores)
-        found = mutual_matches(scores, self.adaptation.threshold)
+        found = mutual_matches(scores, self.threshold)
         # Pruning keeps the order, so matches stay ascending in ``index0``.
         index0 = index[:n0]
         index1 = index[n0:] - split
@@ -272,7 +271,7 @@ class LightGlue(nn.Module):
 
     def _confidence(self, x: Tensor, layer: int) -> Tensor | None:
         """Return how sure each keypoint is of its match, or of having none: (N,) in 0..1."""
-        if self.adaptation.depth <= 0:
+        if self.depth <= 0:
             return None
         token = self.token_confidence[layer].get_submodule("token")
         confidence: Tensor = token(x)[0, :, 0].sigmoid()
@@ -283,16 +282,16 @@ class LightGlue(nn.Module):
         if confidence is None:
             return False
         unsure = int((confidence < self._threshold(layer)).sum())
-        return 1 - unsure / total > self.adaptation.depth
+        return 1 - unsure / total > self.depth
 
     def _kept(self, x: Tensor, n0: int, confidence: Tensor | None, layer: int) -> Tensor | None:
         """Return the indices of the keypoints to keep, or ``None`` if no image is pruned."""
         fewest = MIN_PRUNED_KEYPOINTS.get(x.device.type, 0)
         prunes0 = n0 > fewest
         prunes1 = x.shape[1] - n0 > fewest
-        if self.adaptation.width <= 0 or not (prunes0 or prunes1):
+        if self.width <= 0 or not (prunes0 or prunes1):
             return None
-        kept = self.assignment(layer).match_probability(x) > 1 - self.adaptation.width
+        kept = self.assignment(layer).match_probability(x) > 1 - self.width
         # A keypoint that is still unsure may become a match in a later layer.
         if confidence is not None:
             kept |= confidence <= self._threshold(layer)

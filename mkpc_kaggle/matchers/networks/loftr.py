@@ -12,6 +12,25 @@ from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
 from mkpc_kaggle.matchers.networks.semi_dense import HEADS, SemiDenseNetwork
 
 
+class LoftrTransformer(LinearTransformer):
+    """The coarse transformer: linear attention after positions of a ``decay``."""
+
+    def __init__(self, decay: float) -> None:
+        super().__init__(TOP, HEADS, cycles=4)
+        self.decay = decay
+
+    def forward(
+        self, coarse0: Tensor, coarse1: Tensor, masks: MaskPair | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Map (N, 256, h, w) of both images to (N, h, w, 256)."""
+        grid0 = with_positions(coarse0, self.decay)  # (N, h, w, 256)
+        grid1 = with_positions(coarse1, self.decay)
+        # Linear attention has no notion of rows and columns: cells become tokens (N, h w, 256).
+        flat_masks = None if masks is None else (masks[0].flatten(1), masks[1].flatten(1))
+        tokens0, tokens1 = super().forward(grid0.flatten(1, 2), grid1.flatten(1, 2), flat_masks)
+        return tokens0.view_as(grid0), tokens1.view_as(grid1)
+
+
 class Loftr(SemiDenseNetwork):
     """LoFTR. Sides are multiples of 8; the two images may differ in size.
 
@@ -19,27 +38,8 @@ class Loftr(SemiDenseNetwork):
     border 0.
     """
 
-    multiple = 8
-
     def __init__(self, training: Training = Training.OUTDOOR) -> None:
-        super().__init__(LinearTransformer(TOP, HEADS, cycles=4))
+        indoor = training is Training.INDOOR
         # A wrong encoding loads without an error, and matches become worse.
-        self.decay = ORIGINAL_DECAY
-        if training is Training.INDOOR:
-            self.decay = FIXED_DECAY
-            self.border = 0
-
-    def transform(
-        self, coarse0: Tensor, coarse1: Tensor, masks: MaskPair | None = None
-    ) -> tuple[Tensor, Tensor]:
-        grid0 = with_positions(coarse0, self.decay)  # (N, h, w, 256)
-        grid1 = with_positions(coarse1, self.decay)
-        # Linear attention has no notion of rows and columns: cells become tokens (N, h w, 256).
-        flat_masks = None
-        if masks is not None:
-            mask0, mask1 = masks
-            flat_masks = (mask0.flatten(1), mask1.flatten(1))
-        cells0 = grid0.flatten(1, 2)
-        cells1 = grid1.flatten(1, 2)
-        tokens0, tokens1 = self.loftr_coarse(cells0, cells1, flat_masks)
-        return tokens0.view_as(grid0), tokens1.view_as(grid1)
+        decay = FIXED_DECAY if indoor else ORIGINAL_DECAY
+        super().__init__(LoftrTransformer(decay), border=0 if indoor else 2)

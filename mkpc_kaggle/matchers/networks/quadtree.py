@@ -197,8 +197,15 @@ class QuadtreeTransformer(nn.Module):
         super().__init__()
         self.layers = nn.ModuleList(QuadtreeLayer(TOP, HEADS, topks) for _ in range(LAYERS))
 
-    def forward(self, x0: Tensor, x1: Tensor) -> tuple[Tensor, Tensor]:
-        """Map grids (N, h, w, C) of both images to the same shapes."""
+    def forward(
+        self, coarse0: Tensor, coarse1: Tensor, masks: MaskPair | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Map (N, 256, h, w) of both images to (N, h, w, 256).
+
+        As published, masks apply to the matching of coarse cells only, not to attention.
+        """
+        x0 = with_positions(coarse0, FIXED_DECAY)
+        x1 = with_positions(coarse1, FIXED_DECAY)
         for index, layer in enumerate(self.layers):
             crossed = index % 2 == 1
             source0 = x1 if crossed else x0
@@ -213,19 +220,8 @@ class QuadtreeTransformer(nn.Module):
 class Quadtree(SemiDenseNetwork):
     """LoFTR with quadtree attention. Sides are multiples of 32; two images may differ in size.
 
-    The published code needs two images of one size. As published, masks apply to the matching of
-    coarse cells only, not to attention.
+    The published code needs two images of one size.
     """
-
-    multiple = 32
 
     def __init__(self, training: Training = Training.OUTDOOR) -> None:
         super().__init__(QuadtreeTransformer(TOPKS[training]))
-
-    def transform(
-        self, coarse0: Tensor, coarse1: Tensor, masks: MaskPair | None = None
-    ) -> tuple[Tensor, Tensor]:
-        grid0 = with_positions(coarse0, FIXED_DECAY)
-        grid1 = with_positions(coarse1, FIXED_DECAY)
-        transformed0, transformed1 = self.loftr_coarse(grid0, grid1)
-        return transformed0, transformed1

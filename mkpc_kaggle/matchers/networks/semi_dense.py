@@ -4,8 +4,6 @@ In order: backbone, coarse transformer, dual softmax of all pairs of coarse cell
 fine windows.
 """
 
-from abc import ABC, abstractmethod
-
 import torch
 from torch import Tensor, nn
 
@@ -30,21 +28,25 @@ TEMPERATURE = 0.1  # of the dual softmax
 WINDOWS_AT_ONCE = {"cpu": 1024, "cuda": 8192}
 
 
-class SemiDenseNetwork(nn.Module, ABC):
+class SemiDenseNetwork(nn.Module):
     """A semi-dense network for inference only: in evaluation mode, without gradients.
 
-    ``multiple``: both sides of an image must be multiples of it. Confidences of matches exceed
-    ``threshold``. ``border``: the width, in coarse cells, of the margin that gets no matches.
+    ``loftr_coarse`` maps the coarse maps (N, 256, h, w) of both images, and their masks or ``None``,
+    to grids (N, h, w, 256). ``border``: the width, in coarse cells, of the margin that gets no
+    matches. Confidences of matches exceed ``threshold``.
     """
 
-    multiple: int
     threshold = 0.2
-    border = 2
 
-    def __init__(self, loftr_coarse: nn.Module) -> None:
+    def __init__(
+        self, loftr_coarse: nn.Module, border: int = 2, *, learned_temperature: bool = False
+    ) -> None:
         super().__init__()
         self.backbone = ResNetFpn()
         self.loftr_coarse = loftr_coarse
+        self.border = border
+        learned = {"temperature": torch.tensor(1 / TEMPERATURE)} if learned_temperature else {}
+        self.coarse_matching = nn.ParameterDict(learned)
         self.fine_preprocess = FinePreprocess(TOP, FINE)
         self.loftr_fine = LinearTransformer(FINE, HEADS, cycles=1)
         self.eval().requires_grad_(False)
@@ -53,13 +55,9 @@ class SemiDenseNetwork(nn.Module, ABC):
     def similarity_scale(self) -> float | Tensor:
         """Factor of the dot product of two coarse features before the dual softmax."""
         # Each feature is divided by the square root of its number of channels.
+        if self.coarse_matching:
+            return self.coarse_matching.get_parameter("temperature") / TOP
         return 1 / (TOP * TEMPERATURE)
-
-    @abstractmethod
-    def transform(
-        self, coarse0: Tensor, coarse1: Tensor, masks: MaskPair | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Transform the coarse maps (N, 256, h, w) of both images to grids (N, h, w, 256)."""
 
     def encode(self, image: Tensor) -> FeatureMaps:
         """Encode gray images (B, 1, H, W), float32 in [0, 1]."""
@@ -70,7 +68,7 @@ class SemiDenseNetwork(nn.Module, ABC):
         self, features0: FeatureMaps, features1: FeatureMaps, masks: MaskPair | None = None
     ) -> SemiDenseMatches:
         """Match a pair; each image's mask (1, H/8, W/8) bool is True at the content, top left."""
-        grids = self.transform(features0.coarse, features1.coarse, masks)
+        grids = self.loftr_coarse(features0.coarse, features1.coarse, masks)
         check_finite("coarse features", *grids)
         (grid0,), (grid1,) = grids  # (h, w, 256)
         content = None if masks is None else (masks[0][0], masks[1][0])

@@ -16,6 +16,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.dtypes import check_finite
 
 CELL = 8  # pixels: the stride of the features
+BORDER = 4  # pixels: the width of a margin without keypoints
 SUPPRESSION_ROUNDS = 2  # each recovers points that only suppressed points exceed
 
 
@@ -37,23 +38,17 @@ class SuperPoint(nn.Module):
     """A trunk of eight convolutions, a detector head (Pa, Pb) and a descriptor head (Da, Db).
 
     ``nms_radius``: half the suppression window, in pixels. Scores are above ``keypoint_threshold``.
-    ``max_keypoints``: the number to keep, -1 for all. ``border``: the width in pixels of a margin
-    without keypoints. SuperGlue's published results use, in this order, 3, 0.005, 2048, 4 outdoors
-    and 4, 0.005, 1024, 4 indoors. For inference only.
+    ``max_keypoints``: the number to keep, -1 for all. SuperGlue's published results use, in this
+    order, 3, 0.005, 2048 outdoors and 4, 0.005, 1024 indoors. For inference only.
     """
 
     def __init__(
-        self,
-        nms_radius: int = 4,
-        keypoint_threshold: float = 0.005,
-        max_keypoints: int = -1,
-        border: int = 4,
+        self, nms_radius: int = 4, keypoint_threshold: float = 0.005, max_keypoints: int = -1
     ) -> None:
         super().__init__()
         self.nms_radius = nms_radius
         self.keypoint_threshold = keypoint_threshold
         self.max_keypoints = max_keypoints
-        self.border = border
         self.conv1a = nn.Conv2d(1, 64, 3, padding=1)
         self.conv1b = nn.Conv2d(64, 64, 3, padding=1)
         self.conv2a = nn.Conv2d(64, 64, 3, padding=1)
@@ -124,13 +119,12 @@ class SuperPoint(nn.Module):
         Points are float32, (x, y) in pixels.
         """
         height, width = scores.shape
-        border = self.border
         # The margin of the map, not of the image. It is cut after the suppression, so a point in it
         # may suppress an inner one. A negative end would count from the other side.
-        inner = scores[border : max(height - border, 0), border : max(width - border, 0)]
+        inner = scores[BORDER : max(height - BORDER, 0), BORDER : max(width - BORDER, 0)]
         rows, columns = torch.nonzero(inner > self.keypoint_threshold, as_tuple=True)
         kept = inner[rows, columns]
-        points = torch.stack([columns + border, rows + border], dim=1).float()
+        points = torch.stack([columns + BORDER, rows + BORDER], dim=1).float()
         if 0 <= self.max_keypoints < len(kept):
             kept, strongest = kept.topk(self.max_keypoints)
             points = points[strongest]

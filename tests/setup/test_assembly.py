@@ -12,9 +12,9 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
 from mkpc_kaggle.scene.view_graph import BatchImage
+from mkpc_kaggle.setup.assembly import Assembly, assemble
 from mkpc_kaggle.weights import WeightFile
 from mkpc_kaggle.weights import store as weight_store
 from mkpc_kaggle.weights.manifest import manifest

@@ -5,7 +5,6 @@ other recipe is refused, with the command that fetches the weights.
 """
 
 import os
-import reprlib
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -97,12 +96,6 @@ class Assembly:
             }
         return settings
 
-    @property
-    def unversioned(self) -> list[str]:
-        """The recipe's matchers whose results are not kept for later runs."""
-        own = [name for name in self.recipe.matcher_names if name in self.matchers]
-        return [name for name in own if not self.matchers[name].spec.version]
-
     @cached_property
     def weight_files(self) -> dict[str, FoundFile]:
         """The weight files of the recipe's matchers, by slot."""
@@ -149,17 +142,13 @@ def assemble(
     :func:`mkpc_kaggle.recipe.with_settings`. Raises :class:`UserError`, also if weights of a
     recipe other than ``auto`` are missing.
     """
-    own = {} if matchers is None else matchers
+    own = dict(matchers or {})
     require_matchers(own)
     directories, files = weights_of(weights)
     store = WeightStore(directories, chosen=files)
     chosen = recipe_of_name(recipe, own)
-    if not isinstance(settings, Mapping):
-        raise TypeError(
-            f"settings is {reprlib.repr(settings)}; expected a mapping from dotted keys"
-        )
-    if settings:
-        chosen = with_settings(chosen, settings)
+    if changes := dict(settings):
+        chosen = with_settings(chosen, changes)
     missing = missing_weights(chosen, store, own)
     if missing and recipe != AUTO:
         raise UserError(
@@ -240,10 +229,6 @@ def recipe_of_name(recipe: Recipe | PathSource, own: Container[str] = ()) -> Rec
     """
     if isinstance(recipe, Recipe):
         return recipe
-    if not isinstance(recipe, str | os.PathLike):
-        raise TypeError(
-            f"recipe must be a Recipe, a name or the path of a TOML file, not {reprlib.repr(recipe)}"
-        )
     name = os.fspath(recipe)
     if name in own or name in MATCHERS:
         return recipe_of_matcher(name)

@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 
 from mkpc_kaggle.matchers.contract import Placement
-from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.recipe import Recipe, Unit, with_settings
+from mkpc_kaggle.setup.assembly import Assembly
 from mkpc_kaggle.weights import WeightStore
 
 # A key of points is made of these settings: an option that is missing from them would leave old
