@@ -10,7 +10,7 @@ import warnings
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from io import BytesIO
@@ -22,10 +22,9 @@ from typing import Any, BinaryIO
 import cv2
 import numpy as np
 import PIL.Image
-from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from mkpc_kaggle.config import Range
-from mkpc_kaggle.errors import open_regular, plural, shown
+from mkpc_kaggle.errors import open_regular, shown
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
 # Pillow's names of the formats that are read. Its readers of others may start programs.
@@ -45,7 +44,6 @@ MAX_ASPECT = 32
 ORIENTATION = 0x0112
 EXIF_DIRECTORY = 0x8769  # of the tags that only EXIF has
 TIFF_SIDES = 0x0100, 0x0101
-TIFF_BITS, TIFF_CHANNELS = 0x0102, 0x0115
 FOCAL_MM = 0x920A
 PLANE_RESOLUTION = 0xA20E  # pixels per unit of the sensor
 PLANE_UNIT = 0xA210
@@ -181,17 +179,7 @@ def _unknown(data: bytes) -> str:
     if not data:
         return "the file is empty"
     if data[:4] in (b"II*\0", b"MM\0*"):
-        kind = "another kind"
-        with (
-            suppress(Exception),
-            warnings.catch_warnings(action="ignore"),
-        ):  # of a damaged directory
-            tags = ImageFileDirectory_v2(data[:8])
-            stream = BytesIO(data)
-            stream.seek(tags.next)
-            tags.load(stream)
-            kind = f"{plural(tags[TIFF_CHANNELS], 'channel')} of {tags[TIFF_BITS][0]} bits"
-        return f"a TIFF file of {kind}; convert it to 1, 3 or 4 channels of 8 or 16 bits"
+        return "a TIFF file of another kind than 1, 3 or 4 channels of 8 or 16 bits; convert it"
     return "not a picture of a known format; convert it to JPEG or PNG"
 
 

@@ -74,7 +74,7 @@ def test_a_file_that_is_not_a_picture_has_its_reason(tmp_path):
     bands = ImageFileDirectory_v2()
     bands.update({0x0102: (16,) * 5, 0x0115: 5})
     (tmp_path / "bands.tif").write_bytes(b"II*\0\x08\0\0\0" + bands.tobytes(8))
-    assert reason(tmp_path / "bands.tif").startswith("a TIFF file of 5 channels of 16 bits; ")
+    assert reason(tmp_path / "bands.tif").startswith("a TIFF file of another kind than 1, 3 or 4 ")
     # The limit is 32 : 1.
     long = "300 x 3 pixels: one side is more than 32 times the other"
     assert reason(write(tmp_path / "line.png", noise(3, 300))) == long
