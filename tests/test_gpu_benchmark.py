@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from benchmarks.gpu.record import (
     EXPECTED,
 )
@@ -13,6 +15,8 @@ from benchmarks.gpu.record import (
 ROOT = Path(__file__).resolve().parents[1]
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_a_rehearsal_on_the_cpu_runs_every_part(tmp_path):
     command = [sys.executable, "-m", "benchmarks.gpu", "--device", "cpu", "--quick"]
     command += ["--out", str(tmp_path)]

@@ -2,6 +2,7 @@
 
 import random
 import threading
+import time
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,9 @@ def test_a_run_whose_workers_are_killed_at_random_moments_ends_as_the_undisturbe
         assert report.ending is Ending.COMPLETE, report.about.faults
         return report
 
+    start = time.monotonic()
     undisturbed = run_whole("undisturbed")
+    whole_s = time.monotonic() - start
     assert undisturbed.about.faults == []
     spawn = process.spawn
     born = count()
@@ -39,10 +42,12 @@ def test_a_run_whose_workers_are_killed_at_random_moments_ends_as_the_undisturbe
 
     def doomed(name: str, log: Path | None = None) -> Any:
         made, pipe = spawn(name, log)
+        number = next(born)
         # One of three: a job that is lost twice is given up.
-        if next(born) % 3 == 0:
-            # From its imports to the last answer
-            threading.Timer(rng.uniform(0.0, 3.0), made.kill).start()
+        if number % 3 == 0:
+            # From its imports to the last answer; the first at once, so that one is lost in any case
+            seconds = rng.uniform(0.0, whole_s) if number else 0.0
+            threading.Timer(seconds, made.kill).start()
         return made, pipe
 
     monkeypatch.setattr(process, "spawn", doomed)

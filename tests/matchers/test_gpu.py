@@ -55,7 +55,6 @@ def test_the_parent_of_workers_never_initialises_cuda(monkeypatch):
     gpus_here(monkeypatch, (7, 5), (7, 5))
     made = assemble("classical", device="cuda")
     site = LocalSite(made, None, time.monotonic)
-    site.open()
     assert [place.name for place in site.of(Kind.MATCH)] == ["cuda:0", "cuda:1"]
 
 
