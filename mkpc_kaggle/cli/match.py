@@ -15,8 +15,8 @@ from mkpc_kaggle.reporting.figures import require_format, save
 HELP = """\
 Match two images. Print the fundamental matrix F (x1^T F x0 = 0, pixel centres at integers), the
 number of matches of each unit, and the critical regions. Points are in pixels of the stored
-files, without the EXIF orientation; figures are upright. --out draws the matches
-and the critical regions.
+files, without the EXIF orientation; figures are upright. --out draws the matches and the critical
+regions.
 
 Exit status: 0 done, 1 every unit failed, 2 bad input.
 """

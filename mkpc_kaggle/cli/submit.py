@@ -81,15 +81,10 @@ def run(arguments: argparse.Namespace) -> int:
             logger.info("\n".join(filter(None, lines)))
             _, images = test_side(arguments.test_dir)
             report = submit(pairs, assembly, session, output, str(images))
-            session.status = int(
-                bool(report.about.unwritten or report.about.unsaved or trouble(report))
-            )
-            unwritten = (
-                f" is not the last version: {report.about.unwritten}"
-                if report.about.unwritten
-                else ""
-            )
+            unwritten, unsaved = report.about.unwritten, report.about.unsaved
+            session.status = int(bool(unwritten or unsaved or trouble(report)))
+            reason = f" is not the last version: {unwritten}" if unwritten else ""
             # A file that could not be replaced is an earlier version; it is complete, too.
             # Before the report: drawing may exceed the time limit.
-            logger.info(f"{summary(report)}\nsubmission: {output}{unwritten}")
+            logger.info(f"{summary(report)}\nsubmission: {output}{reason}")
             return options.finish(session, page, pairs)
