@@ -81,8 +81,8 @@ class Request:
 
     ``cameras`` are the user's known cameras. With ``scenes_dir``, a batch is reconstructed as a whole, and
     each scene has COLMAP's files in a folder there, named by its key. ``publish`` is called with the state, whose
-    ``fundamentals``, ``scenes`` and ``digests`` are the results so far: at the start, every half minute (less
-    often if slow), after each scene with files, and at the end.
+    ``fundamentals`` and ``scenes`` are the results so far: at the start, every half minute (less often if slow),
+    after each scene with files, and at the end.
     """
 
     pairs: Sequence[Pair]

@@ -204,7 +204,7 @@ class State:
 
     @property
     def written(self) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
-        """The F to write (R, 3, 3) for each row of the request, and its source (R,), the first that exists:
+        """For each row of the request, the source (R,) of its F, and F (R, 3, 3); the first that exists:
 
         - the F of the pair's cameras, unless its matches contradict it (:func:`mkpc_kaggle.scene.choose.choose`);
         - the F of its matches; with ``[focal]``, and if the cameras of two different files give no F, at the focal
