@@ -8,7 +8,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 
 def test_no_process_grows_in_a_run_of_1500_pairs_that_is_resumed(tmp_path):
     # Small pictures: all fit into the caches, which may fill.
-    soaked = soak(tmp_path, 1500, workers=2, interval=0.2, size=Size(64, 48))
+    soaked = soak(tmp_path, 1500, workers=2, interval=0.1, size=Size(64, 48))
     assert soaked.pairs == 1500
     long = [process for process in soaked.processes if process.is_long]
     parents = [process for process in long if process.name.startswith("parent")]
