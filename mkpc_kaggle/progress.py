@@ -1,9 +1,12 @@
 """Progress of a wait: tqdm's bars, and the text of a duration."""
 
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from typing import TextIO, TypeVar
+
+from mkpc_kaggle.errors import UserError
 
 LINE_INTERVAL_S = 30.0  # between lines where a line cannot be redrawn in place
 REDRAW_S = 0.2  # between redraws: a reader sees no more, and a terminal may be slow
@@ -18,6 +21,23 @@ def format_duration(seconds: float) -> str:
         return f"{seconds:.1f}s"
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes}m{rest:02d}s" if minutes < 60 else f"{minutes // 60}h{minutes % 60:02d}m"
+
+
+def parse_duration(text: str) -> float:
+    """Return the seconds of ``8h45m``, ``90m``, ``60s`` or a number. Raise :class:`UserError` for
+    other text.
+    """
+    parts = re.fullmatch(
+        r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)s)?|(\d+(?:\.\d+)?)", text.strip()
+    )
+    if parts is None or not any(parts.groups()):
+        raise UserError(
+            f"{text!r} is not a duration; write it as 8h45m, 90m, 60s or a number of seconds"
+        )
+    hours, minutes, seconds, number = (float(part or 0) for part in parts.groups())
+    if not (total := hours * 3600 + minutes * 60 + seconds + number):
+        raise UserError("a time limit of 0 leaves no time to work")
+    return total
 
 
 def counted(items: Sequence[Item], what: str, unit: str) -> Iterable[Item]:

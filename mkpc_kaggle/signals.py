@@ -1,10 +1,15 @@
-"""Ctrl-C and SIGTERM as an event, which work checks, or as an exception."""
+"""Ctrl-C and SIGTERM as an event, which work checks, or as an exception, and the end of a parent."""
 
+import ctypes
+import multiprocessing
+import os
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from types import FrameType
+
+PR_SET_PDEATHSIG = 1  # of Linux's prctl
 
 
 class Interrupt(threading.Event):
@@ -47,3 +52,19 @@ def interruptible() -> Iterator[Interrupt]:
                 restored.callback(signal.signal, number, former)
                 signal.signal(number, note)
         yield interrupt
+
+
+def end_with_parent() -> None:
+    """End this process with its parent, even during a computation.
+
+    On Linux, it also ends with the thread that started it, and even if stopped (SIGSTOP).
+    """
+    with suppress(OSError, AttributeError):  # not on Linux
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+    def wait() -> None:
+        if parent := multiprocessing.parent_process():
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()

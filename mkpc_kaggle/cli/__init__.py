@@ -36,7 +36,7 @@ def program(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run a command and end the process at once: an orderly exit takes a second or longer."""
     try:  # Ctrl-C during slow imports is not an error
         status = main(arguments)
-        from mkpc_kaggle.engine.console import leave
+        from mkpc_kaggle.setup.console import leave
     except KeyboardInterrupt:
         os._exit(EXIT_INTERRUPTED)
     leave(status)
@@ -49,8 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     output closed the pipe. The time limit counts from the call, before the slow imports.
     """
     started = time.monotonic()
-    from mkpc_kaggle.engine.console import logger
     from mkpc_kaggle.errors import UserError
+    from mkpc_kaggle.setup.console import logger
 
     for stream in (sys.stdout, sys.stderr):
         # Paths and ids may have characters that the terminal cannot encode.

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.data.competition import Pair, TrainScene, read_train_side
-from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
+from mkpc_kaggle.engine.budget import Budget, monotonic_of
 from mkpc_kaggle.engine.cluster import parse_workers
-from mkpc_kaggle.engine.console import drain, logger, queued
 from mkpc_kaggle.engine.session import Session
 from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.progress import parse_duration
 from mkpc_kaggle.recipe import parse_setting, split_mode
 from mkpc_kaggle.setup.assembly import Assembly, assemble
+from mkpc_kaggle.setup.console import drain, logger, queued
 from mkpc_kaggle.signals import Interrupt
 
 RECIPE = """a recipe, or one matcher such as aliked_lightglue (default: auto, every matcher with its weights).

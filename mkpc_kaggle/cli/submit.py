@@ -6,10 +6,10 @@ from pathlib import Path
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.competition import missing_line, read_test_side, test_side
 from mkpc_kaggle.data.outputs import require_apart
-from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.engine.session import first_version, submit
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
+from mkpc_kaggle.setup.console import logger
 from mkpc_kaggle.signals import interruptible
 
 HELP = """\

@@ -8,7 +8,6 @@ from pathlib import Path
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.competition import TrainScene, missing_line
 from mkpc_kaggle.data.outputs import require_apart
-from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.engine.session import Session
 from mkpc_kaggle.errors import UserError, temporary_directory
 from mkpc_kaggle.evaluation.validate import (
@@ -20,6 +19,7 @@ from mkpc_kaggle.evaluation.validate import (
 )
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 from mkpc_kaggle.setup.assembly import Assembly
+from mkpc_kaggle.setup.console import logger
 from mkpc_kaggle.signals import interruptible
 
 HELP = """\

@@ -77,6 +77,33 @@ class TrainScene:
     pairs: tuple[TruePair, ...]
 
 
+def distinct_pairs(rows: Iterable[Pair]) -> tuple[list[Pair], NDArray[np.int_]]:
+    """Return the distinct pairs of a table, the first row of each, and the pair of each row.
+
+    Rows of a batch with the same two images are one pair: they share its points and its estimate.
+    """
+    pairs: list[Pair] = []
+    known: dict[Any, int] = {}
+    pair_of_row = []
+    for pair in rows:
+        key = (pair.group, pair.file0, pair.file1, pair.turns)
+        if key not in known:
+            known[key] = len(pairs)
+            pairs.append(pair)
+        pair_of_row.append(known[key])
+    return pairs, np.array(pair_of_row, int)
+
+
+def names_of(pair: Pair, root: str) -> tuple[str, str]:
+    """Return the paths of a pair's images below ``root``."""
+    return name_below(root, pair.file0), name_below(root, pair.file1)
+
+
+def name_below(root: str, file: str) -> str:
+    """Return a file's path relative to ``root``, or the whole path if the file lies elsewhere."""
+    return file.removeprefix(root.rstrip("/") + "/") if root else file
+
+
 def test_side(directory: Path) -> tuple[Path, Path]:
     """Return the paths of ``test.csv`` and ``test_images/``."""
     home = directory.parent if directory.name == "test_images" else directory

@@ -275,6 +275,18 @@ def content_digest(path: Path) -> str:
         return hashlib.file_digest(stream, BLAKE2).hexdigest()
 
 
+def image_facts(path: Path) -> tuple[str, Size, float] | Unreadable:
+    """Return digest, size and focal length of an image file, decoded only if its head cannot be read."""
+    try:
+        with open_regular(path) as stream, open_picture(stream) as picture:
+            size = stored_size(picture)
+            _, focal = exif_facts(exif_tags(picture), size)
+        return content_digest(path), size, focal
+    except Exception:  # any error of Pillow: the decoder says what is wrong
+        image = read_image(path)
+    return (image.version, image.size, image.focal) if isinstance(image, Image) else image
+
+
 class ByteCache:
     """Cache of the most recently used values, up to ``limit`` bytes. Not thread-safe."""
 

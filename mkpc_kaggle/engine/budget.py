@@ -5,18 +5,16 @@ then gets SIGKILL (a Ray actor is killed by Ray), and its job is lost. A worker 
 cannot be killed: the run continues without its answer.
 """
 
-import re
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from math import inf, sqrt
 from statistics import fmean, median_low
+from threading import Event
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mkpc_kaggle.engine.request import EstimateJob, Job, MatchJob
+from mkpc_kaggle.engine.request import Job, MatchJob, SceneJob
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Unit
 
@@ -49,23 +47,6 @@ MAX_UNKNOWN_S = 3600.0  # without a limit, no share is finite
 UNMEASURED_ESTIMATE_S = 1.0
 START_S = 300.0  # for a worker to load its matchers, which is slow from a network disk
 MAX_STEP_BACK_S = 60.0  # of the wall clock, between --started-at and the start
-
-
-def parse_duration(text: str) -> float:
-    """Return the seconds of ``8h45m``, ``90m``, ``60s`` or a number. Raise :class:`UserError` for
-    other text.
-    """
-    parts = re.fullmatch(
-        r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)s)?|(\d+(?:\.\d+)?)", text.strip()
-    )
-    if parts is None or not any(parts.groups()):
-        raise UserError(
-            f"{text!r} is not a duration; write it as 8h45m, 90m, 60s or a number of seconds"
-        )
-    hours, minutes, seconds, number = (float(part or 0) for part in parts.groups())
-    if not (total := hours * 3600 + minutes * 60 + seconds + number):
-        raise UserError("a time limit of 0 leaves no time to work")
-    return total
 
 
 @dataclass
@@ -123,6 +104,9 @@ class Budget:
     def limit(self) -> float:
         return self.started + self.time_limit
 
+    def is_over(self, interrupt: Event) -> bool:
+        return interrupt.is_set() or self.clock() >= self.stop_waiting
+
     def left(self) -> float:
         """Return the seconds until :attr:`stop_units`; never negative."""
         return max(0.0, self.stop_units - self.clock())
@@ -139,10 +123,6 @@ class Costs:
     """
 
     def __init__(self) -> None:
-        self.forget()
-
-    def forget(self) -> None:
-        """Forget all measurements: another device takes over."""
         self._measured: dict[str, deque[float]] = {}
         # Of the latest measurements, since a mean of 64 values for each plan would take longer than
         # the plan.
@@ -184,17 +164,13 @@ class Costs:
         self._scene_seconds += max(0.0, seconds - SCENE_START_S)
         self._scene_matches += matches
 
-    def scenes(self, matches: NDArray[np.int_]) -> NDArray[np.float64]:
-        """Return the expected seconds of scenes with these numbers of matches, each alone."""
+    def scenes(self, matches: Any) -> Any:
+        """Return the expected seconds of a scene by its number of matches, or of several by an array of these."""
         # The matches of all scenes together, because small ones are mostly start-up time.
         rate = SCENE_MATCH_S
         if self._scene_matches:
             rate = self._scene_seconds / self._scene_matches
-        return np.asarray(SCENE_START_S + matches * SCENE_MARGIN * rate)
-
-    def scene(self, matches: int) -> float:
-        """Return the expected seconds of a scene with this number of matches."""
-        return float(self.scenes(np.array([matches]))[0])
+        return SCENE_START_S + matches * SCENE_MARGIN * rate
 
     def warm_up(self, units: Iterable[Unit]) -> float:
         """Return the longest warm-up of these units, in seconds, by the latest of each unit."""
@@ -226,17 +202,16 @@ def time_limit(job: Job, costs: Costs, budget: Budget, since: float) -> float:
         # A warm-up alone says little: it may take a hundred times as long as a later run, or less.
         if all(costs.is_known(unit.name) for unit in job.units):
             of_pair = sum(costs.mean(unit.name) for unit in job.units)
-            seconds = HANG_FACTOR * len(job.indices) * of_pair + costs.warm_up(job.units)
-    elif isinstance(job, EstimateJob):
-        of_pair = costs.mean(COST_OF_ESTIMATES)
-        seconds = HANG_FACTOR * len(job.pairs) * (of_pair or UNMEASURED_ESTIMATE_S)
-        # A hung first estimate must not use up a short limit.
-        if not of_pair:
-            seconds = min(seconds, unknown(budget, since))
-    else:
+            seconds = HANG_FACTOR * len(job.pairs) * of_pair + costs.warm_up(job.units)
+    elif isinstance(job, SceneJob):
         # Small scenes measured so far say little about the time of a large one.
         unmeasured = SCENE_START_S + SCENE_MATCH_S * job.matches
-        seconds = HANG_FACTOR * max(costs.scene(job.matches), unmeasured)
+        seconds = HANG_FACTOR * max(costs.scenes(job.matches), unmeasured)
+    else:
+        of_pair = costs.mean(COST_OF_ESTIMATES)
+        # A hung first estimate must not use up a short limit.
+        most = inf if of_pair else seconds
+        seconds = min(most, HANG_FACTOR * len(job.pairs) * (of_pair or UNMEASURED_ESTIMATE_S))
     return budget.silence + seconds
 
 

@@ -16,16 +16,10 @@ from numpy.typing import NDArray
 from mkpc_kaggle.engine.request import About, Ending
 from mkpc_kaggle.engine.store import Store, undamaged
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.coordinates import Box, Matrix3
-from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
+from mkpc_kaggle.geometry.critical_region import from_json
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import (
-    FALLBACK_FUNDAMENTAL,
-    Estimate,
-    ModelKind,
-    sampson_distances,
-)
-from mkpc_kaggle.pipeline.pair import PairMatch, Regions, UnitResult
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Estimate
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, recipe_of
 from mkpc_kaggle.scene.candidates import title_of
 from mkpc_kaggle.scene.records import CAMERAS, SceneRecord
@@ -102,34 +96,18 @@ class Results:
                 used = self.units[self.units["pair"] == pair]
                 columns = "key, data, regions"
                 stored = {key: more for key, *more in store.select("points", columns, used["key"])}
-                found = []
+                results = []
                 crops = None
                 for unit in used.to_dict("records"):
                     data, regions = stored.get(unit["key"], (None, ""))
                     # Points that the pair does not need are not used.
                     if unit["is_needed"] and data is not None:
-                        found.append(UnitResult(units[unit["unit"]], Matches.from_bytes(data)))
-                    crops = crops or (regions_of(regions) if regions else None)
+                        results.append(UnitResult(units[unit["unit"]], Matches.from_bytes(data)))
+                    crops = crops or from_json(regions)
+                match = PairMatch(tuple(results), crops)
                 F = FALLBACK_FUNDAMENTAL if row["own"] is None else np.reshape(row["own"], (3, 3))
-                estimate = nearest_to(F, found, row["inliers"], row["failure"])
-                yield PairMatch(tuple(found), crops, estimate)
-
-
-def nearest_to(F: Matrix3, results: Iterable[UnitResult], count: int, failure: str) -> Estimate:
-    """Return the estimate F of a pair; its inliers are the ``count`` matches that are nearest to F."""
-    distances = sampson_distances(F, Matches.concatenate(each.matches for each in results))
-    inliers = np.zeros(len(distances), bool)
-    inliers[np.argsort(distances, kind="stable")[:count]] = True
-    return Estimate(ModelKind.F, F, inliers, failure)
-
-
-def regions_of(text: str) -> Regions:
-    """Return the critical regions of a pair from the column of its points."""
-    first, second = (
-        CriticalRegion(Box(*box), RegionReason(reason), clusters, kept)
-        for *box, reason, clusters, kept in json.loads(text)
-    )
-    return first, second
+                found = Estimate.of_nearest(F, match.matches, row["inliers"], row["failure"])
+                yield replace(match, estimate=found)
 
 
 def results(directory: Path | str) -> Results:
@@ -171,8 +149,8 @@ def results_of(store: Store) -> Results:
     if row is None:
         raise UserError(f"{store.directory}: the run has not begun, or was stopped at its start")
     facts = json.loads(row[0])
-    about = About(**{name: facts[name] for name in vars(About())})
-    about = replace(about, ending=Ending(about.ending))
+    stored = facts.pop("scenes")
+    about = About(**{**facts, "ending": Ending(facts["ending"])})
     estimates = {key: json.loads(text) for key, text in store.db.execute(ESTIMATES)}
     units = unit_rows(store, estimates)
     pairs = frame_of(store, PAIRS)
@@ -186,19 +164,20 @@ def results_of(store: Store) -> Results:
         each.get("failure", error or NOT_REACHED)
         for each, error in zip(found, pairs["error"], strict=True)
     ]
-    pairs["support"] = np.array([each.get("support", 0.0) for each in found], float)
     pairs["own"] = [each.get("F") for each in found]
     pairs["magsac"] = [each.get("magsac") for each in found]
     elements = np.frombuffer(b"".join(pairs.pop("F"))).reshape(-1, 9)
     pairs[ELEMENTS] = DataFrame(elements, index=pairs.index)
     images = frame_of(store, IMAGES)
-    stored = store.facts(key for _, key, _ in facts["scenes"])
+    records = store.facts(key for _, key, _ in stored)
     scenes = [
-        SceneRecord.from_json(stored[key]) if key in stored else SceneRecord(batch, failure=failure)
-        for batch, key, failure in facts["scenes"]
+        SceneRecord.from_json(records[key])
+        if key in records
+        else SceneRecord(batch, failure=failure)
+        for batch, key, failure in stored
     ]
-    made = {scene.batch for scene in scenes}
-    scenes += [SceneRecord(batch, failure=TOO_FEW) for batch in about.files if batch not in made]
+    others = about.files.keys() - {scene.batch for scene in scenes}
+    scenes += [SceneRecord(batch, failure=TOO_FEW) for batch in sorted(others)]
     points = {
         (scene.batch, number): np.frombuffer(b64decode(cloud), "<f4").reshape(-1, 3).astype(float)
         for scene in scenes

@@ -18,22 +18,13 @@ from typing import Any
 import cv2
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.data.images import (
-    Image,
-    content_digest,
-    exif_facts,
-    exif_tags,
-    file_state,
-    open_picture,
-    read_image,
-    stored_size,
-)
+from mkpc_kaggle.data.images import Unreadable, file_state, image_facts
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.store import Store
-from mkpc_kaggle.errors import open_regular
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.scene.view_graph import BatchImage
 from mkpc_kaggle.setup.assembly import Assembly
+from mkpc_kaggle.setup.console import Progress
 
 # Versions of the algorithms, each in the digests of its kind. With a wrong version, old results would
 # pass as today's, which no later check notices.
@@ -145,59 +136,43 @@ def contents_of(images: Sequence[BatchImage], turns: Sequence[int]) -> str:
 # Images
 
 
-def image_facts(
+def read_images(
     store: Store,
     files: Mapping[str, Path],
     is_over: Callable[[], bool],
-    show: Callable[[int, int], None] = lambda *_: None,
+    progress: Progress,
 ) -> tuple[dict[str, BatchImage], dict[str, str]]:
     """Return digest, size and focal length of each image by name, and why the others cannot be read.
 
     Stored facts of files whose size and time have not changed are used, and new ones are stored. A run reads each
-    photograph once before its first job: photographs do not change during a run. ``show`` is called with the
-    numbers of files that were read and that must be.
+    photograph once before its first job: photographs do not change during a run.
     """
     columns = "name, size, changed, digest, width, height, focal"
-    stored = {row[0]: row for row in store.select("image", columns, files)}
     states = {name: file_state(path) for name, path in files.items()}
-    known: dict[str, BatchImage] = {}
+    images: dict[str, BatchImage] = {}
     unreadable: dict[str, str] = {}
-    for name, (_, *state, content, width, height, focal) in stored.items():
+    for name, *state, content, width, height, focal in store.select("image", columns, files):
         # A missing file keeps its results: perhaps nothing must be matched.
         if states[name] in (tuple(state), (0, 0)):
-            known[name] = BatchImage(name, content, Size(width, height), focal)
-    new = [name for name in files if name not in known]
+            images[name] = BatchImage(name, content, Size(width, height), focal)
+    new = [name for name in files if name not in images]
     # Threads, since both reading and hashing release the interpreter lock.
     pool = ThreadPoolExecutor(HASH_THREADS)
-    pending = {pool.submit(_read_facts, name, files[name]) for name in new}
+    pending = {pool.submit(lambda name: (name, image_facts(files[name])), name) for name in new}
     while pending and not is_over():
         done, pending = wait(pending, CHECK_S)
-        show(len(new) - len(pending), len(new))
+        progress.count("reading", len(new) - len(pending), len(new), "image")
         rows = []
-        for image in (future.result() for future in done):
-            if isinstance(image, BatchImage):
-                known[image.name] = image
-                facts = (image.digest, *image.size, image.focal)
-                rows.append((image.name, *states[image.name], *facts))
+        for name, facts in (future.result() for future in done):
+            if isinstance(facts, Unreadable):
+                unreadable[name] = str(facts)
             else:
-                unreadable[image[0]] = image[1]
+                images[name] = BatchImage(name, *facts)
+                content, size, focal = facts
+                rows.append((name, *states[name], content, *size, focal))
         # In parts, so that a kill loses little of it.
-        if rows:
-            store.put({"image": rows})
+        store.put({"image": rows})
     # Do not wait for the threads at work: a file of many GB takes long.
     pool.shutdown(wait=False, cancel_futures=True)
-    return known, unreadable
-
-
-def _read_facts(name: str, path: Path) -> BatchImage | tuple[str, str]:
-    """Return the facts about an image file, or its name and the reason why it cannot be read."""
-    try:
-        with open_regular(path) as stream, open_picture(stream) as picture:
-            size = stored_size(picture)
-            _, focal = exif_facts(exif_tags(picture), size)
-            return BatchImage(name, content_digest(path), size, focal)
-    except Exception:  # any error of Pillow: the decoder says what is wrong
-        image = read_image(path)
-    if isinstance(image, Image):
-        return BatchImage(name, image.version, image.size, image.focal)
-    return name, str(image)
+    progress.close()
+    return images, unreadable

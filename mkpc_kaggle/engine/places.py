@@ -15,7 +15,7 @@ from pathlib import Path
 
 from mkpc_kaggle.cores import available_cores
 from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
-from mkpc_kaggle.engine.request import Answer, Cause, EstimateJob, Failure, Job, Loaded, MatchJob
+from mkpc_kaggle.engine.request import Answer, Cause, Failure, Job, Loaded
 from mkpc_kaggle.engine.worker import MatchRunner, estimates_runner, scene_runner
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.setup.assembly import Assembly
@@ -51,7 +51,7 @@ class Place:
     is_loaded: bool = False
     has_answered: bool = False  # to any job
     strikes: int = 0
-    lost: list[tuple[MatchJob | EstimateJob, list[int]]] = field(default_factory=list)
+    lost: list[tuple[Job, list[int]]] = field(default_factory=list)
     closed: str = ""
     since: float = 0.0
     restart_at: float = -inf
@@ -59,10 +59,6 @@ class Place:
     @property
     def is_idle(self) -> bool:
         return self.is_loaded and self.job is None
-
-    @property
-    def is_starting(self) -> bool:
-        return self.worker is not None and not self.is_loaded
 
     def may_start(self, now: float) -> bool:
         return self.worker is None and not self.closed and now >= self.restart_at
@@ -74,7 +70,7 @@ class Place:
         self.worker.start()
 
     def submit(self, job: Job, now: float) -> None:
-        """Hand a job to the idle worker."""
+        """Hand a job to the worker, which may still be starting."""
         assert self.worker is not None
         self.job = job
         self.since = now
@@ -95,6 +91,7 @@ class Place:
             answer = Failure(Cause.TIMED_OUT, f"no answer for {now - self.since:.0f} s")
         if isinstance(answer, Loaded):
             self.is_loaded = True
+            self.since = now
         elif isinstance(answer, Failure) and not (self.is_loaded and answer.cause is Cause.RAISED):
             self.kill()
         return answer
@@ -178,9 +175,10 @@ class Site:
         places = [place for place in self.places if place.kind is Kind.MATCH]
         return "; ".join(place.closed for place in places if place.closed)
 
-    def scenes_at_a_time(self, *, is_matching: bool) -> int:
-        """Return the number of cores for scenes: the ones that matching leaves free, at least one."""
-        return max(1, self._cores - self.matching_cores * is_matching)
+    @property
+    def scenes_beside(self) -> int:
+        """The number of scenes next to matching: the cores that it leaves free, at least one."""
+        return max(1, self._cores - self.matching_cores)
 
     def fall_back(self) -> None:
         """Let the fallback places take over matching."""

@@ -9,7 +9,6 @@ Process pools of the package pebble were rejected. They time jobs by the wall cl
 killed during an answer keeps the lock of all others.
 """
 
-import ctypes
 import multiprocessing
 import os
 import queue
@@ -26,6 +25,7 @@ from typing import cast
 
 from mkpc_kaggle.engine.request import Answer, Cause, Failure, Job
 from mkpc_kaggle.engine.worker import Executor, Maker, Message, Runner, failure_of
+from mkpc_kaggle.signals import end_with_parent
 
 # For PyTorch, which reads these once. OpenMP threads that wait for each other then sleep; by default they spin
 # and keep the cores from decoding, MAGSAC and other processes. On Linux, tensors of 2 MiB or more use huge pages:
@@ -36,7 +36,6 @@ WORKER_ENVIRONMENT = {
     "THP_MEM_ALLOC_ENABLE": "1",
 }
 _environment = threading.Lock()  # two threads may start processes at a time
-PR_SET_PDEATHSIG = 1  # of Linux's prctl
 EXIT_TIMEOUT_S = 5.0  # for a process to end after its pipe has closed
 
 
@@ -200,19 +199,3 @@ def serve(pipe: Connection, log: Path | None = None) -> None:
         while True:
             pipe.send(executor.answer(message))
             message = pipe.recv()
-
-
-def end_with_parent() -> None:
-    """End this process with its parent, even during a computation.
-
-    On Linux, it also ends with the thread that started it, and even if stopped (SIGSTOP).
-    """
-    with suppress(OSError, AttributeError):  # not on Linux
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-
-    def wait() -> None:
-        if parent := multiprocessing.parent_process():
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()

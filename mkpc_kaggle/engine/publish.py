@@ -33,8 +33,10 @@ class Publication:
         interval = max(INTERVAL_S, self._budget.writing / TIME_SHARE)
         return now - self._published > interval
 
-    def publish(self, about: About) -> None:
-        """Write the results, and the rows of the pairs that have changed since the last version."""
+    def publish(self, about: About, *, is_last: bool = False) -> None:
+        """Write the results, and the rows of the pairs that have changed since the last version. After the last
+        one, the watchdog writes no other.
+        """
         start = self._budget.clock()
         self.save()
         run = (0, len(self._state.pair_of_row), json.dumps(self._facts(about)))
@@ -42,6 +44,7 @@ class Publication:
         # The measured time decides when the last version is written.
         self._published = self._budget.clock()
         self._budget.note_write(self._published - start)
+        self._has_ended = is_last
 
     def save(self) -> str:
         """Write the results unless the run has ended. Return why that failed, or an empty text."""
@@ -56,22 +59,12 @@ class Publication:
                     self.unwritten = f"the results cannot be written: {error}"
         return self.unwritten
 
-    def end(self, about: About) -> None:
-        """Publish the last version. After it, the watchdog writes no other."""
-        self.publish(about)
-        self._has_ended = True
-
     def _facts(self, about: About) -> dict[str, object]:
         state = self._state
-        scenes = state.scenes
-        # The key of each batch's scene, or the reason why it has none
-        keys = [
-            (batch, scenes[batch].key, "")
-            if batch in scenes
-            else (batch, "", state.missing_scene(batch))
-            for batch in state.batches
-        ]
-        return {**asdict(about), "scenes": keys}
+        # The key of each batch's scene, and the reason if it has none
+        keys = {batch: scene.key for batch, scene in state.scenes.items()}
+        scenes = [(each, keys.get(each, ""), state.missing_scene(each)) for each in state.batches]
+        return {**asdict(about), "scenes": scenes}
 
     def _rows(self) -> list[tuple[object, ...]]:
         """Return the rows of the pairs that have changed."""
@@ -110,13 +103,11 @@ class Publication:
         """Return name, key, need and failure of each unit of a pair that has points, or a failure."""
         state = self._state
         reasons = state.reasons.get(index, {})
+        facts = [facts[index].tolist() for facts in (state.points, state.done, state.needed)]
         units = []
-        done = state.done[index].tolist()
-        needed = state.needed[index].tolist()
-        for number, key in enumerate(state.points[index].tolist()):
-            name = state.units[number].name
-            if done[number]:
-                units.append((name, key.decode(), needed[number], ""))
+        for name, key, is_done, is_needed in zip(state.number_of, *facts, strict=True):
+            if is_done:
+                units.append((name, key.decode(), is_needed, ""))
             elif name in reasons:
-                units.append((name, "", needed[number], reasons[name]))
+                units.append((name, "", is_needed, reasons[name]))
         return units

@@ -9,18 +9,14 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.keys import Images, Keys
+from mkpc_kaggle.engine.keys import Images, Keys, contents_of
 from mkpc_kaggle.engine.store import Source
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.intrinsics import Rows
-from mkpc_kaggle.geometry.robust import NO_STATS, EstimateStats
-from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
+from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.scene.candidates import ALL_UNITS
+from mkpc_kaggle.scene.candidates import title_of
 from mkpc_kaggle.scene.sfm import Solution
 
 if TYPE_CHECKING:
@@ -99,40 +95,27 @@ class Request:
 
 
 @dataclass(frozen=True, eq=False)
-class MatchJob:
-    """Run ``units`` on pairs whose images have these ``digests``, in the recipe's order.
-
-    ``expected`` are the expected seconds of each unit on a pair. A unit begins only if it is expected to end
-    within ``seconds`` of the job's start. ``given`` has the points of each pair that its crops come from,
-    besides the job's own. ``upcoming`` are the images that will probably be matched next.
-    """
-
-    indices: Sequence[int]
-    units: Sequence[Unit]
-    expected: Sequence[float]
-    seconds: float
-    pairs: Sequence[Pair]
-    digests: Sequence[tuple[str, ...]]
-    given: Sequence[tuple[UnitResult, ...]] = ()
-    upcoming: Sequence[Path] = ()
-
-
-@dataclass(frozen=True, eq=False)
 class PairInputs:
-    """Inputs of a pair's estimate or of a scene: its images, and the keys of its points by unit.
+    """Inputs of a job on a pair: its images, and the keys of its points by unit, in the recipe's order.
 
-    The units are in the recipe's order. ``own`` is for a scene: F from the pair's own matches.
+    For a scene, ``estimate`` is the key of the pair's estimate, and ``own`` its F.
     """
 
     index: int
+    pair: Pair
     images: Images
     points: Mapping[Unit, str]
+    estimate: str = ""
     own: Matrix3 | None = None
+
+    @property
+    def contents(self) -> str:
+        return contents_of(self.images, self.pair.turns)
 
 
 @dataclass(frozen=True, eq=False)
-class EstimateJob:
-    """Estimate F of each pair."""
+class Job:
+    """Work on some pairs. Their points are in ``source``."""
 
     pairs: tuple[PairInputs, ...]
     recipe: Recipe
@@ -143,28 +126,61 @@ class EstimateJob:
         return [pair.index for pair in self.pairs]
 
 
-@dataclass(frozen=True, eq=False)
-class SceneJob:
-    """Reconstruct a batch from ``matches`` matches, with COLMAP's files in ``folder``, if any.
+@dataclass(frozen=True)
+class MatchPlan:
+    """Missing ``units`` on ``pairs``, one or a minibatch, by their numbers.
 
-    A ``candidate`` other than the first has its own ``key``, and ``scene`` is the key of the first. The
-    answer is a :class:`Solution`, with choices in the order of the pairs, which have ``contents``.
+    ``expected`` are the seconds of each unit on a pair. A unit begins only if it is expected to end within
+    ``seconds`` of the job's start. ``upcoming`` are the pairs that will probably follow.
     """
 
+    phase: int
+    pairs: list[int]
+    units: list[int]
+    expected: list[float]
+    seconds: float
+    upcoming: list[int]
+
+
+@dataclass(frozen=True, eq=False)
+class MatchJob(Job):
+    """Run the units of a plan, in the recipe's order. The pairs have the points that their crops come from,
+    besides the job's own. ``upcoming`` are the images that will probably be matched next.
+    """
+
+    plan: MatchPlan
+    upcoming: Sequence[Path] = ()
+
+    @property
+    def units(self) -> list[Unit]:
+        return [self.recipe.units[number] for number in self.plan.units]
+
+
+@dataclass(frozen=True, eq=False)
+class EstimateJob(Job):
+    """Estimate F of each pair."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneJob(Job):
+    """Reconstruct a batch from ``matches`` matches, with COLMAP's files in ``folder``, if any.
+
+    ``scene`` are the numbers of the batch and of the candidate, which has its own ``key``; ``first`` is the key
+    of the first candidate. The answer is a :class:`Solution`, with choices in the order of the pairs.
+    """
+
+    scene: tuple[int, int]
     batch: str
+    candidate: str
     key: str
-    pairs: tuple[PairInputs, ...]
-    contents: tuple[str, ...]
-    recipe: Recipe
-    source: Source
+    first: str
     matches: int = 0
     folder: Path | None = None
     cameras: Rows = ()
-    candidate: str = ALL_UNITS
-    scene: str = ""
 
-
-Job = MatchJob | EstimateJob | SceneJob
+    def __str__(self) -> str:
+        tracks = f" by the tracks of {title_of(self.candidate)}" if self.candidate else ""
+        return f"batch {self.batch}{tracks}"
 
 
 @dataclass(frozen=True)
@@ -178,14 +194,9 @@ class Loaded:
 
 @dataclass(frozen=True, eq=False)
 class Estimated:
-    """The estimate of a pair from the points with these keys; ``inliers`` has a count for each key."""
+    """The estimate of a pair as facts for the store, see :func:`mkpc_kaggle.engine.worker.estimate_pair`."""
 
-    points: tuple[str, ...]
-    inliers: tuple[int, ...]
-    F: Matrix3
-    failure: str = ""
-    magsac: Matrix3 | None = None
-    stats: EstimateStats = NO_STATS
+    facts: Mapping[str, Any]
     seconds: float = 0.0
 
 
@@ -218,33 +229,6 @@ Answer = Loaded | tuple[PairMatch, ...] | tuple[Estimated, ...] | Solution | Fai
 
 
 # Pairs
-
-
-def distinct_pairs(rows: Iterable[Pair]) -> tuple[list[Pair], NDArray[np.int_]]:
-    """Return the distinct pairs of a table, the first row of each, and the pair of each row.
-
-    Rows of a batch with the same two images are one pair: they share its points and its estimate.
-    """
-    pairs: list[Pair] = []
-    known: dict[Any, int] = {}
-    pair_of_row = []
-    for pair in rows:
-        key = (pair.group, pair.file0, pair.file1, pair.turns)
-        if key not in known:
-            known[key] = len(pairs)
-            pairs.append(pair)
-        pair_of_row.append(known[key])
-    return pairs, np.array(pair_of_row, int)
-
-
-def names_of(pair: Pair, root: str) -> tuple[str, str]:
-    """Return the paths of a pair's images below ``root``."""
-    return name_below(root, pair.file0), name_below(root, pair.file1)
-
-
-def name_below(root: str, file: str) -> str:
-    """Return a file's path relative to ``root``, or the whole path if the file lies elsewhere."""
-    return file.removeprefix(root.rstrip("/") + "/") if root else file
 
 
 def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:

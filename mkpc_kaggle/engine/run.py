@@ -1,22 +1,23 @@
 """The loop of a run, on one thread: give jobs to idle workers, take their answers, publish.
 
-:func:`mkpc_kaggle.engine.plan.plan` decides which pairs, estimates and scenes come next.
+:class:`mkpc_kaggle.engine.plan.Plan` decides which pairs, estimates and scenes come next.
 """
 
 import json
-import sqlite3
+import logging
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
 from typing import Self, cast
 
+import numpy as np
+
 from mkpc_kaggle.engine.budget import COST_OF_ESTIMATES, Budget, Costs, start_limit, time_limit
-from mkpc_kaggle.engine.console import Progress, logger
 from mkpc_kaggle.engine.frames import Results, results_of
 from mkpc_kaggle.engine.keys import of_candidate
 from mkpc_kaggle.engine.places import Kind, Place, Site
-from mkpc_kaggle.engine.plan import Crew, MatchPlan, NextWork, is_complete, plan
+from mkpc_kaggle.engine.plan import Crew, Plan, is_complete
 from mkpc_kaggle.engine.publish import Publication
 from mkpc_kaggle.engine.request import (
     About,
@@ -29,15 +30,26 @@ from mkpc_kaggle.engine.request import (
     Job,
     Loaded,
     MatchJob,
+    MatchPlan,
+    PairInputs,
     SceneJob,
 )
-from mkpc_kaggle.engine.state import DEEPEN, ESTIMATE, NEVER, PHASES, RAISED, State
+from mkpc_kaggle.engine.state import (
+    DEEPEN,
+    ESTIMATE,
+    GIVEN_UP,
+    NEVER,
+    PHASES,
+    RAISED,
+    REFUSED,
+    State,
+)
 from mkpc_kaggle.engine.store import Store, points_row
 from mkpc_kaggle.errors import UserError, plural
-from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
-from mkpc_kaggle.scene.candidates import ALL_UNITS, title_of
+from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.scene.records import SceneRecord
 from mkpc_kaggle.scene.sfm import Solution
+from mkpc_kaggle.setup.console import Progress, logger
 
 # Pairs of a job of estimates. More would make the last F of a run wait for each other; single pairs, each with a
 # message and a transaction, would cost the loop more.
@@ -59,9 +71,8 @@ class Run:
         site: Site,
         store: Store,
         budget: Budget,
-        *,
         interrupt: threading.Event,
-        progress: bool = True,
+        progress: Progress,
     ) -> None:
         self.state = state
         self.site = site
@@ -74,7 +85,7 @@ class Run:
         self.units_run = self.estimated = 0
         self.resumed = int(state.complete.sum())
         self.publication = Publication(state, store, budget)
-        self._progress = Progress(budget.left, is_shown=progress)
+        self._progress = progress
         self._explained = ""  # the phase that was explained last
         self._has_loaded = False  # some worker of matching was ready
         self._has_ended = False
@@ -103,7 +114,7 @@ class Run:
             pairs = plural(self.state.rows, "pair")
             self._say(f"{self.resumed} of {pairs} from earlier runs")
         self._publish()
-        while not self.is_over():
+        while not self.budget.is_over(self.interrupt):
             now = self.budget.clock()
             # All answers first, because each may change the next job.
             for place in self.site.places:
@@ -112,10 +123,10 @@ class Run:
                     self._take(place, answer, now)
             if self.site.fallback and (self.site.is_closed or self.state.dead.all()):
                 self._fall_back()
-            work = self.plan(now)
+            plan = self.plan(now)
             for place in self.site.free(now):
-                self._give(place, work, now)
-            if not (work.match or work.estimates or work.scenes or self.site.has_jobs):
+                self._give(place, plan)
+            if not (plan.match or plan.estimates or plan.scenes or self.site.has_jobs):
                 break
             if self.publication.is_due(now):
                 self._publish()
@@ -123,36 +134,33 @@ class Run:
         if self.site.is_closed and not self._has_loaded:
             raise UserError(f"no worker could be started: {self.site.reason}")
 
-    def is_over(self) -> bool:
-        return self.interrupt.is_set() or self.budget.clock() >= self.budget.stop_waiting
-
-    def plan(self, now: float, lost: int = 0) -> NextWork:
-        return plan(self.state, self.costs, self.budget, self.crew, now, lost)
+    def plan(self, now: float, lost: int = 0) -> Plan:
+        return Plan(self.state, self.costs, self.budget, self.crew, now, lost)
 
     @property
     def crew(self) -> Crew:
         """The workers that exist now, without places that are closed."""
-        site = self.site
-        matchers = site.of(Kind.MATCH)
+        matchers, estimators, scenes = map(self.site.of, Kind)
         # All have the same kind of device.
         minibatch = max((place.minibatch for place in matchers), default=1)
-        return Crew(len(matchers), len(site.of(Kind.ESTIMATE)), len(site.of(Kind.SCENE)), minibatch)
+        beside = min(len(scenes), self.site.scenes_beside)
+        return Crew(len(matchers), len(estimators), len(scenes), minibatch, beside)
 
     def _seconds_of(self, place: Place) -> float:
         """Return how long the worker of a place may start, or compute its job, by the costs known now."""
-        if place.job is not None:
+        if place.job is not None and place.is_loaded:
             return time_limit(place.job, self.costs, self.budget, place.since)
-        loads_matchers = place.kind is Kind.MATCH
-        return start_limit(self.budget, place.since, loads_matchers=loads_matchers)
+        return start_limit(self.budget, place.since, loads_matchers=place.kind is Kind.MATCH)
 
     def _take(self, place: Place, answer: Answer, now: float) -> None:
+        if isinstance(answer, Loaded):
+            self._has_loaded |= place.kind is Kind.MATCH
+            self._leave_out(answer)
+            return
         job, place.job = place.job, None
         if isinstance(answer, Failure):
             self.lose(place, job, answer, now)
-        elif job is None:
-            self._has_loaded = self._has_loaded or place.kind is Kind.MATCH
-            self._leave_out(cast(Loaded, answer))
-        else:
+        elif job is not None:
             place.note_answer()
             self.save(job, answer, now - place.since)
         if job is not None and place.kind is Kind.SCENE:
@@ -160,65 +168,42 @@ class Run:
 
     # Handing out
 
-    def _give(self, place: Place, work: NextWork, now: float) -> None:
+    def _give(self, place: Place, plan: Plan) -> None:
         """Give a job to a free place, or start a worker there if there is one to give."""
+        now = plan.now
         job: Job | None = None
-        if place.kind is Kind.MATCH:
-            # Again if a former place has taken these pairs, and for a place that continues elsewhere.
-            is_taken = work.match and self.state.busy[work.match.pairs].min() < NEVER
-            if place.lost or is_taken:
-                work = self.plan(now, len(place.lost))
-            if work.match is not None:
-                self._show(work.match.phase, work.fit)
-                job = self._match_job(work.match) if place.is_idle else None
-        elif place.kind is Kind.ESTIMATE and work.estimates:
-            job = self._estimate_job(work.estimates) if place.is_idle else None
-        elif place.kind is Kind.SCENE and work.scenes:
-            job = self._scene_job(*work.scenes.pop(0)) if place.is_idle else None
-        else:
+        if place.kind is Kind.SCENE:
+            if plan.scenes:
+                place.start(now)
+                place.submit(self._scene_job(*plan.scenes.pop(0)), now)
             return
+        if place.kind is Kind.ESTIMATE:
+            has_work = bool(plan.estimates)
+            if has_work and place.is_idle:
+                job = self._estimate_job(plan.estimates)
+        else:
+            # Again if a former place has taken these pairs, and for a place that continues elsewhere.
+            if place.lost or (plan.match and self.state.busy[plan.match.pairs].min() < NEVER):
+                plan = self.plan(now, len(place.lost))
+            has_work = plan.match is not None
+            if plan.match is not None and place.is_idle:
+                self._show(plan)
+                job = self._match_job(plan.match)
         if job is not None:
             place.submit(job, now)
-        elif not place.is_idle and self._has_room(place, work):
+        elif has_work:
             place.start(now)
 
-    def _has_room(self, place: Place, work: NextWork) -> bool:
-        """Return whether another worker may start: there is work for it, and for a scene a core."""
-        if place.kind is not Kind.SCENE:
-            return place.kind is not Kind.MATCH or work.match is not None
-        places = self.site.of(Kind.SCENE)
-        starting = sum(place.is_starting for place in places)
-        # While matching uses the other cores, scenes have only the cores that it leaves free.
-        is_matching = work.match is not None or self.state.is_matching
-        most = self.site.scenes_at_a_time(is_matching=is_matching)
-        busy = starting + sum(place.job is not None for place in places)
-        return starting < len(work.scenes) and busy < most
-
-    def _match_job(self, chosen: MatchPlan) -> MatchJob | None:
+    def _match_job(self, plan: MatchPlan) -> MatchJob:
         state = self.state
-        crops = [number for number in chosen.units if state.is_crop[number]]
         # The points that the last crop comes from; the worker leaves out those after an earlier one.
-        inputs = [state.points_before(index, max(crops, default=0)) for index in chosen.pairs]
-        keys = [key for points in inputs for key in points.values()]
-        job = MatchJob(
-            chosen.pairs,
-            [state.units[number] for number in chosen.units],
-            chosen.expected,
-            chosen.seconds,
-            [state.pairs[index] for index in chosen.pairs],
-            [tuple(image.digest for image in state.images_of(index)) for index in chosen.pairs],
-            upcoming=[path for index in chosen.upcoming for path in state.pairs[index].images],
-        )
-        try:
-            points = self.store.source(keys).matches(keys)
-        except (UserError, sqlite3.Error, KeyError) as error:  # a disk that fails costs the job
-            self._lose_job(job, f"the store cannot be read: {error}")
-            return None
-        state.busy[chosen.pairs] = chosen.phase
-        given = [
-            tuple(UnitResult(unit, points[key]) for unit, key in pair.items()) for pair in inputs
-        ]
-        return replace(job, given=given)
+        last = max((unit for unit in plan.units if state.is_crop[unit]), default=0)
+        pairs = tuple(state.inputs_of(pair, state.points_before(pair, last)) for pair in plan.pairs)
+        state.busy[plan.pairs] = plan.phase
+        upcoming = [path for index in plan.upcoming for path in state.pairs[index].images]
+        # To another machine, if the worker is there
+        source = self.store.source(_keys(pairs), is_sent=True)
+        return MatchJob(pairs, state.request.recipe, source, plan, upcoming)
 
     def _estimate_job(self, due: list[int]) -> EstimateJob:
         """Take the first pairs that are due; one with a lost job is alone."""
@@ -228,32 +213,31 @@ class Run:
         due[:] = [index for index in due if index not in chosen]
         state.estimating[chosen] = True
         pairs = tuple(map(state.inputs_of, chosen))
-        keys = [key for pair in pairs for key in pair.points.values()]
-        return EstimateJob(pairs, state.request.recipe, self.store.source(keys))
+        return EstimateJob(pairs, state.request.recipe, self.store.source(_keys(pairs)))
 
-    def _scene_job(self, batch: int, candidate: str) -> SceneJob:
+    def _scene_job(self, batch: int, candidate: int) -> SceneJob:
         """Take a batch's candidate, from the results in use now.
 
         If its pairs get other results meanwhile, the scene is stale when it arrives.
         """
         state = self.state
         request = state.request
-        indices, first = state.scene_inputs(batch)
-        pairs = tuple(map(state.inputs_of, indices))
-        key = of_candidate(first, candidate)
+        pairs, first = state.scene_inputs(batch)
+        name = state.candidates[candidate]
+        key = of_candidate(first, name)
         state.making.add((batch, candidate))
         return SceneJob(
-            list(state.batches)[batch],
-            key,
             pairs,
-            contents=tuple(map(state.contents, indices)),
-            recipe=request.recipe,
-            source=self.store.source([key for pair in pairs for key in pair.points.values()]),
-            matches=state.matches_of_candidate(batch, candidate),
+            request.recipe,
+            self.store.source(_keys(pairs)),
+            (batch, candidate),
+            list(state.batches)[batch],
+            name,
+            key,
+            first,
+            matches=int(state.scene_matches[batch, candidate]),
             folder=None if request.scenes_dir is None else request.scenes_dir / key,
             cameras=request.cameras,
-            candidate=candidate,
-            scene=first,
         )
 
     # Answers
@@ -263,13 +247,12 @@ class Run:
         self.state.release(job)
         if isinstance(job, MatchJob):
             self._save_points(job, cast(Sequence[PairMatch], answer))
-        elif isinstance(job, EstimateJob):
-            self._save_estimates(job, cast(Sequence[Estimated], answer))
-        else:
+        elif isinstance(job, SceneJob):
             self._save_scene(job, cast(Solution, answer), seconds)
+        else:
+            self._save_estimates(job, cast(Sequence[Estimated], answer))
         # A full disk or a lock: the run continues, and the user may make room.
-        if self.store.trouble:
-            self.fault(self.store.trouble)
+        self.fault(self.store.trouble)
 
     def _save_points(self, job: MatchJob, answer: Sequence[PairMatch]) -> None:
         state = self.state
@@ -278,37 +261,32 @@ class Run:
             # An unreadable image stays unreadable in this run.
             if outcome.failure:
                 state.note_unreadable(index, outcome.failure)
-            for found in outcome.results:
-                unit = state.number_of[found.unit.name]
+            for result in outcome.results:
+                unit = state.number_of[result.unit.name]
                 # Failures are not stored: the next run tries them again.
-                if found.failure:
+                if result.failure:
                     state.losses[index, unit] = RAISED
-                    state.note_reason(index, found.unit.name, found.failure)
+                    state.note_reason(index, result.unit.name, result.failure)
                     continue
                 # In the recipe's order, as a crop's key has those of the points before it
                 key = state.key(index, unit)
-                state.losses[index, unit] = 0
-                regions = (outcome.regions or ()) if found.unit.stage == 2 else ()
-                rows.append(points_row(key, found, regions))
-                state.use_points(index, unit, key, len(found.matches), is_needed=found.is_needed)
+                rows.append(points_row(key, result, outcome.regions or ()))
+                state.use_points(index, unit, key, len(result.matches), is_needed=result.is_needed)
                 # A unit that the pair does not need took no time.
-                if found.is_needed:
-                    self.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
+                if result.is_needed:
+                    self.costs.observe(result.unit.name, result.seconds, warm_up=result.warm_up)
                     self.units_run += 1
         self.store.put({"points": rows})
 
-    def _save_estimates(self, job: EstimateJob, answer: Sequence[Estimated]) -> None:
+    def _save_estimates(self, job: Job, answer: Sequence[Estimated]) -> None:
         state = self.state
         rows = []
-        for pair, found in zip(job.pairs, answer, strict=True):
+        for pair, estimate in zip(job.pairs, answer, strict=True):
             # Under the key of the points that the worker read, which may be older than the state's
-            key = state.request.keys.of_estimate(found.points)
-            facts = _estimate_facts(found)
-            rows.append((key, json.dumps(facts)))
-            state.losses[pair.index, ESTIMATE] = 0
-            state.reasons.get(pair.index, {}).pop("estimate", None)
-            state.use_estimate(pair.index, key, facts)
-            self.costs.observe(COST_OF_ESTIMATES, found.seconds)
+            key = state.request.keys.of_estimate(pair.points.values())
+            rows.append((key, json.dumps(estimate.facts)))
+            state.use_estimate(pair.index, key, estimate.facts)
+            self.costs.observe(COST_OF_ESTIMATES, estimate.seconds)
         self.store.put({"result": rows})
         self.estimated += len(answer)
         # While pairs are matched, the bar shows their units.
@@ -318,11 +296,12 @@ class Run:
             self._progress.count("estimate", done, total, "pair")
 
     def _save_scene(self, job: SceneJob, answer: Solution, seconds: float) -> None:
+        contents = [pair.contents for pair in job.pairs]
         record = SceneRecord.of(
             job.batch,
             answer.reconstructions,
             seconds=seconds,
-            choices=dict(zip(job.contents, answer.choices, strict=True)),
+            choices=dict(zip(contents, answer.choices, strict=True)),
             candidate=job.candidate,
             # Later digits vary between processors
             disagreement=float(f"{answer.disagreement:.6g}"),
@@ -331,20 +310,25 @@ class Run:
         self.store.put({"result": [(job.key, record.to_json())]})
         # The time of the loop, with the process's start: the forecast needs both.
         self.costs.observe_scene(job.matches, seconds)
-        self.state.use_scene(self.state.batches[job.batch], record, job.scene)
+        self.state.use_scene(job.scene[0], record, job.first)
         images = f"{record.registered} of {plural(record.images, 'image')} with a camera"
-        text = f"batch {job.batch}: {images}{_by_tracks(job.candidate)}"
+        text = f"{job}: {images}"
         # Other candidates are lines of the log.
-        (self._say if job.candidate == ALL_UNITS else logger.debug)(text)
+        if job.candidate:
+            logger.debug(text)
+        else:
+            self._say(text)
         if job.folder is not None:
             self._publish()  # tables of cameras should agree with COLMAP's files
 
     def _leave_out(self, answer: Loaded) -> None:
         """Continue without the matchers that could not be loaded, and say so once."""
+        state = self.state
         for name, reason in answer.refused.items():
-            if name not in self.state.refused:
-                self.warn(f"{name} is left out: {reason}")
-        self.state.refuse(answer.refused)
+            self.fault(f"{name} is left out: {reason}", logging.WARNING)
+        is_refused = [unit.matcher in answer.refused for unit in state.units]
+        state.unit_losses[is_refused] = REFUSED
+        state.dead |= is_refused
 
     # Losses
 
@@ -364,52 +348,55 @@ class Run:
             place.strikes += 1
         else:
             self.fault(f"a job was lost on {place.name}: {failure}")
-            self._count_loss(place, job, failure)
+            self.state.release(job)
+            if isinstance(job, SceneJob):
+                self._lose_scene(job, failure)
+            else:
+                self._lose_pairs(place, job, failure)
         place.restart_at = now + RESTART_PAUSE_S * place.strikes
         # A refusal is an answer of the configuration, which no other worker would change.
         if place.strikes >= MAX_LOSSES or failure.cause is Cause.REFUSED:
             self._close(place, failure)
 
-    def _count_loss(self, place: Place, job: Job, failure: Failure) -> None:
+    def _lose_scene(self, job: SceneJob, failure: Failure) -> None:
+        self.fault(f"{job} was not reconstructed: {failure}")
+        state = self.state
+        state.scene_losses[job.scene] += 1
+        if (
+            not job.candidate
+            and state.stale[job.scene[0]]
+            and state.scene_losses[job.scene] >= GIVEN_UP
+        ):
+            state.scene_failures[job.scene[0]] = str(failure)
+
+    def _lose_pairs(self, place: Place, job: Job, failure: Failure) -> None:
         state = self.state
         is_fresh = not state.has_losses(job)
-        self._lose_job(job, str(failure))
-        # A worker that reports an ordinary error works, and each scene has a process of its own.
-        if failure.cause is Cause.RAISED or isinstance(job, SceneJob):
+        state.lose(job, str(failure))
+        # A worker that reports an ordinary error works.
+        if failure.cause is Cause.RAISED:
             place.note_answer()
             return
         blamed: list[int] = []
         is_match = isinstance(job, MatchJob)
         if isinstance(job, MatchJob) and not any(self.costs.mean(each.name) for each in job.units):
-            blamed = state.columns_of(job)
+            blamed = job.plan.units
         if is_fresh:
-            self._blame(blamed, failure)
+            state.unit_losses[blamed] += 1
+            self._skip_units(failure)
             place.strikes += not place.has_answered or (is_match and not blamed)
         elif is_match and not place.has_answered and self.site.has_other(place):
             place.strikes = MAX_LOSSES
         place.lost.append((job, blamed if is_fresh else []))
 
-    def _blame(self, units: Sequence[int], failure: Failure) -> None:
-        """Count a loss of units that never ran."""
+    def _skip_units(self, failure: Failure) -> None:
+        """Skip the units that never ran, and were lost on more pairs than there are places."""
         state = self.state
-        for unit in units:
-            state.unit_losses[unit] += 1
-            if state.unit_losses[unit] == len(self.site.of(Kind.MATCH)) + 1:
-                state.dead[unit] = True
-                name = state.units[unit].name
-                self.fault(f"{name} is skipped on all pairs: it never ran ({failure})")
-
-    def _lose_job(self, job: Job, reason: str) -> None:
-        """Count a lost job of its pairs, or of its scene."""
-        self.state.release(job)
-        if isinstance(job, SceneJob):
-            self.fault(
-                f"batch {job.batch} was not reconstructed{_by_tracks(job.candidate)}: {reason}"
-            )
-            self.state.lose_scene(self.state.batches[job.batch], job.candidate, reason)
-        else:
-            for index, name in self.state.lose(job, reason):
-                logger.debug(f"{name} is skipped on pair {index} ({reason})")
+        dead = state.unit_losses > max(1, len(self.site.of(Kind.MATCH)))
+        for unit in np.flatnonzero(dead & ~state.dead).tolist():
+            name = state.units[unit].name
+            self.fault(f"{name} is skipped on all pairs: it never ran ({failure})")
+        state.dead = dead
 
     def _close(self, place: Place, failure: Failure) -> None:
         """Start no worker at a place any more, and take back its losses."""
@@ -420,45 +407,43 @@ class Run:
         for job, blamed in place.lost:
             state.take_back(job)
             state.unit_losses[blamed] -= 1
-        state.dead = state.unit_losses > max(1, len(self.site.of(Kind.MATCH)))
-        state.refuse({})
+        self._skip_units(failure)
         if not self.site.of(Kind.SCENE):
-            state.give_up_scenes(str(failure))
+            for batch in np.flatnonzero(state.stale).tolist():
+                state.scene_failures.setdefault(batch, str(failure))
 
     def _fall_back(self) -> None:
         """Continue on the fallback places: all matching places are closed, or every unit is skipped."""
         reason = self.site.reason or Ending.NOTHING_RUNS
-        self.warn(f"matching continues on the {self.site.fallback[0].name}: {reason}")
+        name = self.site.fallback[0].name
+        self.fault(f"matching continues on the {name}: {reason}", logging.WARNING)
         self.site.fall_back()
         # Costs, losses and refusals say nothing about the other device.
-        self.costs.forget()
+        self.costs = Costs()
         self.state.begin_anew()
 
     # Messages
 
-    def fault(self, text: str) -> None:
-        """Record a fault, once for each text: a broken disk would fill the log with them."""
-        if text not in self.faults and len(self.faults) < MAX_FAULTS:
+    def fault(self, text: str, level: int = logging.DEBUG) -> None:
+        """Record a fault, if any, once for each text: a broken disk would fill the log with them."""
+        if text and text not in self.faults and len(self.faults) < MAX_FAULTS:
             self.faults.append(text)
-            logger.debug(text)
-
-    def warn(self, text: str) -> None:
-        """Record a fault, and print it at once."""
-        self.faults.append(text)
-        logger.warning(text)
+            logger.log(level, text)
 
     def _say(self, text: str) -> None:
         self._progress.note(text)
         logger.debug(text)
 
-    def _show(self, phase: int, fit: int) -> None:
+    def _show(self, plan: Plan) -> None:
         """Show the phase and the units that are done; a change of phase is a line of the log."""
         done = self.state.done[: self.state.rows]
-        self._progress.count(PHASES[phase], int(done.sum()), done.size, "unit")
-        text = PHASES[phase]
+        text = PHASES[plan.phase]
+        self._progress.count(text, int(done.sum()), done.size, "unit")
         # In other phases, the number of units that fit changes with each pair.
-        if phase == DEEPEN:
-            text = f"{text}: {fit} of {plural(len(self.state.units), 'unit')} fit for all pairs"
+        if plan.phase == DEEPEN:
+            text = (
+                f"{text}: {plan.fit} of {plural(len(self.state.units), 'unit')} fit for all pairs"
+            )
         if text != self._explained:
             self._explained = text
             logger.debug(text)
@@ -466,13 +451,9 @@ class Run:
     # The end
 
     def _publish(self) -> None:
-        if self._has_ended:
-            self.publication.end(self.about)
-        else:
-            self.publication.publish(self.about)
-        for text in (self.publication.unwritten, self.store.trouble):
-            if text:
-                self.fault(text)
+        self.publication.publish(self.about, is_last=self._has_ended)
+        self.fault(self.publication.unwritten)
+        self.fault(self.store.trouble)
 
     @property
     def about(self) -> About:
@@ -506,21 +487,10 @@ class Run:
     def report(self) -> Results:
         """End the run. Return its results."""
         self.end()
-        if unsaved := self.store.flush():  # the disk may have room again
-            self.fault(unsaved)
+        self.fault(self.store.flush())  # the disk may have room again
         # Facts that a full disk kept from the store
         return replace(results_of(self.store), about=self.about)
 
 
-def _by_tracks(candidate: str) -> str:
-    return f" by the tracks of {title_of(candidate)}" if candidate != ALL_UNITS else ""
-
-
-def _estimate_facts(found: Estimated) -> dict[str, object]:
-    return {
-        "F": found.F.ravel().tolist(),
-        "failure": found.failure,
-        "magsac": None if found.magsac is None else found.magsac.ravel().tolist(),
-        "inliers": dict(zip(found.points, found.inliers, strict=True)),
-        "support": found.stats.support,
-    }
+def _keys(pairs: Sequence[PairInputs]) -> list[str]:
+    return [key for pair in pairs for key in pair.points.values()]

@@ -3,12 +3,12 @@
 import hashlib
 import platform
 import shutil
-import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from math import isfinite
 from pathlib import Path
@@ -21,6 +21,7 @@ import numpy as np
 
 from mkpc_kaggle.data.competition import (
     Pair,
+    names_of,
     read_submission,
     submission_problems,
     write_submission,
@@ -28,11 +29,10 @@ from mkpc_kaggle.data.competition import (
 from mkpc_kaggle.data.outputs import remove_unfinished
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RaySite
-from mkpc_kaggle.engine.console import LOG_NAME, Progress, leave, logged, logger
 from mkpc_kaggle.engine.frames import Results
-from mkpc_kaggle.engine.keys import Keys, image_facts
+from mkpc_kaggle.engine.keys import Keys, read_images
 from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
-from mkpc_kaggle.engine.request import About, Request, names_of
+from mkpc_kaggle.engine.request import About, Request
 from mkpc_kaggle.engine.run import Run
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.store import Store
@@ -40,8 +40,8 @@ from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.recipe import PINHOLES
-from mkpc_kaggle.scene.view_graph import BatchImage
 from mkpc_kaggle.setup.assembly import Assembly
+from mkpc_kaggle.setup.console import LOG_NAME, Progress, leave, logged, logger
 from mkpc_kaggle.signals import Interrupt
 from mkpc_kaggle.version import __version__
 
@@ -188,8 +188,16 @@ def run_pairs(
             f"[scene] has cameras with distortion ({scene.camera_model}), and F ignores it: "
             "use PINHOLE or SIMPLE_PINHOLE here; `mkpc reconstruct` takes all models"
         )
-    budget, interrupt, work_dir = session.budget, session.interrupt, session.work_dir
-    about = about_of(assembly, budget, files)
+    budget = session.budget
+    work_dir = session.work_dir
+    about = About(
+        {**assembly.recipe.table(), "name": assembly.recipe.name},
+        str(assembly.placement),
+        budget.time_limit if isfinite(budget.time_limit) else None,
+        assembly.left_out,
+        versions(),
+        dict(files),
+    )
     keys = Keys.of(assembly)
     request = Request(
         pairs, assembly.recipe, keys, root, assembly.cameras, scenes_dir, about, publish
@@ -199,51 +207,30 @@ def run_pairs(
         for name in (WORKERS_LOG, LOG_NAME) if session.fresh else (WORKERS_LOG,):
             with suppress(OSError):
                 (work_dir / name).unlink(missing_ok=True)
-        state = State(request, *_facts(request, store, session))
+        images: dict[str, Path] = {}
+        for pair in pairs:
+            images |= zip(names_of(pair, root), pair.images, strict=True)
+        progress = Progress(budget.left, is_shown=session.progress)
+        is_over = partial(budget.is_over, session.interrupt)
+        facts = read_images(store, images, is_over, progress)
+        state = State(request, *facts)
         state.restore(store)
         site = _site(pairs, assembly, session)
-        run = Run(state, site, store, budget, interrupt=interrupt, progress=session.progress)
+        run = Run(state, site, store, budget, session.interrupt, progress)
         session.save = run.publication.save
         with logged(work_dir / LOG_NAME), run:
             run.run()
             return run.report()
 
 
-def about_of(assembly: Assembly, budget: Budget, files: Mapping[str, Sequence[str]]) -> About:
-    """Return the facts about a run that are known at its start."""
-    recipe = assembly.recipe
-    limit = budget.time_limit if isfinite(budget.time_limit) else None
-    table = {**recipe.table(), "name": recipe.name}
-    # For readers of a report. Keys have only the versions that change a kind of result for sure.
-    versions = {
+def versions() -> dict[str, str]:
+    """Return versions for readers of a report. Keys have only those that change a kind of result for sure."""
+    return {
         "mkpc_kaggle": __version__,
         "Python": platform.python_version(),
         "PyTorch": metadata.version("torch"),
         "OpenCV": cv2.__version__,
-        "NumPy": metadata.version("numpy"),
-        "SQLite": sqlite3.sqlite_version,
     }
-    placement = str(assembly.placement)
-    return About(table, placement, limit, assembly.left_out, versions, files=dict(files))
-
-
-def _facts(
-    request: Request, store: Store, session: Session
-) -> tuple[dict[str, BatchImage], dict[str, str]]:
-    """Return the facts about the images of a request, as :func:`image_facts`."""
-    budget = session.budget
-    progress = Progress(budget.left, is_shown=session.progress)
-    files: dict[str, Path] = {}
-    for pair in request.pairs:
-        files |= zip(names_of(pair, request.root), pair.images, strict=True)
-    facts = image_facts(
-        store,
-        files,
-        lambda: session.interrupt.is_set() or budget.clock() >= budget.stop_waiting,
-        lambda done, total: progress.count("reading", done, total, "image"),
-    )
-    progress.close()
-    return facts
 
 
 def _site(pairs: Sequence[Pair], assembly: Assembly, session: Session) -> Site:

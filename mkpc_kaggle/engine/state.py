@@ -5,36 +5,29 @@ units of stage 1 before it. A result is used only under today's key.
 """
 
 import json
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from itertools import product
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.data.competition import Pair, distinct_pairs, names_of
 from mkpc_kaggle.engine.keys import Images, contents_of, of_candidate
 from mkpc_kaggle.engine.request import (
-    EstimateJob,
     Job,
     MatchJob,
     PairInputs,
     Request,
     SceneJob,
     batches_of,
-    distinct_pairs,
-    names_of,
     visiting_order,
 )
 from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.crop_need import pays
-from mkpc_kaggle.geometry.robust import (
-    FALLBACK_FUNDAMENTAL,
-    are_models,
-)
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, are_models
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.scene.candidates import ALL_UNITS, best_of, candidates_of
+from mkpc_kaggle.scene.candidates import best_of, candidates_of
 from mkpc_kaggle.scene.densify import extra_pairs_of
 from mkpc_kaggle.scene.records import NO_CAMERAS, NOT_RECONSTRUCTED, SceneRecord
 from mkpc_kaggle.scene.view_graph import BatchImage
@@ -49,10 +42,11 @@ SOURCES = ("fallback", "pair", "scene")
 # remaining units, weakest pairs first; none, since the unit does not fit in the time left, or is done
 SWEEP, CONNECT, DEEPEN, FILL, NEVER = range(5)
 PHASES = ("sweep", "connect", "deepen", "fill", "never")
-# Losses of a unit on a pair, or of an estimate: an item that was lost this many times is given up. A matcher that
-# raised raises again, and costs no worker.
-GIVEN_UP, RAISED = 2, 3
+# Losses of a unit on a pair, of an estimate, or of a scene: an item that was lost this many times is given up. A
+# matcher that raised raises again, and costs no worker. An unreadable image is a fact of the input.
+GIVEN_UP, RAISED, UNREADABLE = 2, 3, 4
 ESTIMATE = -1  # the column of losses of estimates
+REFUSED = 1 << 30  # losses of a unit whose matcher cannot be loaded
 
 
 class State:
@@ -66,16 +60,15 @@ class State:
 
     Of a pair (N,): ``estimate``, the key of the estimate in use; ``estimated``, it is today's; ``F`` (N, 3,
     3), its ``inliers`` and ``has_f``, it is no fallback; ``by_scene`` (N, 3, 3) and ``scene_source``, what
-    the scene in use gives; ``unreadable``; ``busy``, the phase of a job under way, else ``NEVER``;
-    ``estimating``; ``dirty``, other than in the last table of pairs. ``reasons`` has why a unit (by name),
-    the estimate ("estimate") or the pair ("") failed.
+    the scene in use gives; ``busy``, the phase of a job under way, else ``NEVER``; ``estimating``; ``dirty``,
+    other than in the last table of pairs. ``reasons`` has why a unit (by name), the estimate ("estimate") or
+    the pair ("") failed.
 
-    Of a unit (U,): ``unit_losses``, lost jobs of a unit that never ran; ``dead``, no worker runs it;
-    ``refused`` has the reasons of those that cannot be loaded.
+    Of a unit (U,): ``unit_losses``, lost jobs of a unit that never ran; ``dead``, no worker runs it.
 
-    Of a batch (B,), numbered by ``batches``: ``stale``, its scene is not today's; ``made``, its finished
-    candidates from today's results by name; ``scene_losses`` and ``making`` by (batch, candidate).
-    ``batch_of`` (N,) is -1 for a pair without one.
+    Of the B batches and C candidates of their scenes: ``made`` (B, C), the finished ones from today's results;
+    ``scene_losses`` (B, C); ``stale`` (B,), the scene is not today's; ``making``, (batch, candidate) under way.
+    ``batch_of`` (N,) is -1 for a pair without a batch.
     """
 
     def __init__(
@@ -85,7 +78,6 @@ class State:
         unreadable: Mapping[str, str],
     ) -> None:
         self.request = request
-        self.images = images
         distinct, self.pair_of_row = distinct_pairs(request.pairs)
         recipe = request.recipe
         extra = extra_pairs_of(request.pairs, batches_of(request.pairs), recipe.scene)
@@ -96,6 +88,9 @@ class State:
         self.is_crop = np.array([unit.stage == 2 for unit in self.units], bool)
         # Relative to the root, so that a folder that moved keeps its results.
         self.names = [names_of(pair, request.root) for pair in self.pairs]
+        # Nothing is stored of an image that is not known.
+        unknown = {name: BatchImage(name, "", Size(1, 1)) for both in self.names for name in both}
+        self.images = {**unknown, **images}
         # Pairs with a common image are visited together, since its encodings are cached.
         self.order = np.asarray(visiting_order(self.pairs), int)
         self._start_pairs(len(self.pairs), len(self.units))
@@ -118,16 +113,14 @@ class State:
         self.F = np.tile(FALLBACK_FUNDAMENTAL, (count, 1, 1))
         self.has_f = np.zeros(count, bool)
         self.inliers = np.zeros(count, np.int32)
-        self.by_scene = np.zeros((count, 3, 3))
+        self.by_scene = self.F.copy()
         self.scene_source = np.full(count, FALLBACK, np.int8)
-        self.unreadable = np.zeros(count, bool)
         self.busy = np.full(count, NEVER, np.int8)
         self.estimating = np.zeros(count, bool)
         self.dirty = np.ones(count, bool)
         self.reasons: dict[int, dict[str, str]] = {}
         self.unit_losses = np.zeros(units, int)
         self.dead = np.zeros(units, bool)
-        self.refused: dict[str, str] = {}  # by matcher
 
     def _start_batches(self) -> None:
         scene = self.request.recipe.scene
@@ -138,19 +131,19 @@ class State:
         for number, members in enumerate(self.members):
             self.batch_of[members] = number
         self.candidates = candidates_of(self.units, scene)
+        size = (len(batches), len(self.candidates))
+        self.made = np.full(size, None, object)  # of SceneRecord
+        self.scene_losses = np.zeros(size, np.int8)
         self.stale = np.ones(len(batches), bool)
-        self.made: list[dict[str, SceneRecord]] = [{} for _ in batches]
-        self.scene_losses: Counter[tuple[int, str]] = Counter()
         self.scene_failures: dict[int, str] = {}
-        self.making: set[tuple[int, str]] = set()
+        self.making: set[tuple[int, int]] = set()
 
     # Results in use
 
     @property
     def missing(self) -> Mask:
         """(N, U): today's points are missing, and this run can get them."""
-        open_units = ~self.dead & ~self.unreadable[:, None]
-        return np.asarray(~self.done & (self.losses[:, :-1] < GIVEN_UP) & open_units)
+        return np.asarray(~self.done & (self.losses[:, :-1] < GIVEN_UP) & ~self.dead)
 
     @property
     def used(self) -> Mask:
@@ -160,10 +153,14 @@ class State:
     @property
     def lacks_estimate(self) -> Mask:
         """(N,): the row's estimate is not from the points in use, and this run can get it."""
-        is_open = ~self.estimated & (self.losses[:, ESTIMATE] < GIVEN_UP)
-        lacking = self.used.any(1) & is_open
-        lacking[self.rows :] = False  # extra pairs are for scenes alone
-        return np.asarray(lacking)
+        is_row = np.arange(len(self.pairs)) < self.rows  # extra pairs are for scenes alone
+        is_open = is_row & ~self.estimated & (self.losses[:, ESTIMATE] < GIVEN_UP)
+        return np.asarray(is_open & self.used.any(1))
+
+    @property
+    def is_suspect(self) -> Mask:
+        """(N,): a job of the pair was lost, and may be lost again."""
+        return np.asarray(self.losses[:, :ESTIMATE].any(1))
 
     @property
     def is_matching(self) -> bool:
@@ -180,27 +177,31 @@ class State:
         """(rows,): all units and the estimate are today's."""
         return np.asarray((self.done.all(1) & self.estimated)[: self.rows])
 
+    def by_batch(self, values: NDArray[Any]) -> NDArray[np.int_]:
+        """Return the sum of each batch (B,) over its pairs' values (N,)."""
+        # The first bin is of pairs without a batch.
+        sums = np.bincount(self.batch_of + 1, values, minlength=len(self.batches) + 1)
+        return sums[1:].astype(int)
+
     @property
-    def matches_of_batches(self) -> NDArray[np.int_]:
-        """The number of matches (B,) of each batch."""
-        # The first bin counts pairs without a batch.
-        bins = self.batch_of + 1
-        matches = self.matches.sum(1)
-        return np.bincount(bins, matches, minlength=len(self.batches) + 1)[1:].astype(int)
+    def scene_matches(self) -> NDArray[np.int_]:
+        """The number of matches (B, C) that make a candidate's tracks, about."""
+        columns = {name: self.matches[:, number] for name, number in self.number_of.items()}
+        every = self.matches.sum(1)
+        counts = [self.by_batch(columns.get(name, every)) for name in self.candidates]
+        return np.column_stack(counts)
 
-    def matches_of_candidate(self, batch: int, candidate: str) -> int:
-        """Return the number of matches that make a candidate's tracks, about."""
-        matches = self.matches[self.members[batch]]
-        if candidate in self.number_of:
-            matches = matches[:, self.number_of[candidate]]
-        return int(matches.sum())
+    @property
+    def missing_scenes(self) -> Mask:
+        """(B, C): the candidate is not from today's results, and this run can get it."""
+        # Without the first candidate, others have nothing to compare with.
+        is_open = (self.scene_losses < GIVEN_UP) & (self.scene_losses[:, :1] < GIVEN_UP)
+        return np.asarray((self.stale[:, None] | ~self.made.astype(bool)) & is_open)
 
-    def batches_with(self, pairs: Mask) -> Mask:
-        """Return the batches (B,) of these pairs (N,)."""
-        found = np.zeros(len(self.batches), bool)
-        numbers = self.batch_of[pairs]
-        found[numbers[numbers >= 0]] = True
-        return found
+    @property
+    def has_scene(self) -> Mask:
+        """(B,): a scene is in use, even if it is stale."""
+        return self.made[:, 0].astype(bool)
 
     @property
     def written(self) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
@@ -211,11 +212,9 @@ class State:
           lengths of the scene;
         - the fallback.
         """
-        rows = slice(self.rows)
-        by_scene = self.scene_source[rows] != FALLBACK
-        sources = np.where(self.has_f[rows], PAIR, FALLBACK)
-        sources[by_scene] = self.scene_source[rows][by_scene]
-        matrices = np.where(by_scene[:, None, None], self.by_scene[rows], self.F[rows])
+        by_scene = self.scene_source != FALLBACK
+        sources = np.where(by_scene, self.scene_source, np.where(self.has_f, PAIR, FALLBACK))
+        matrices = np.where(by_scene[:, None, None], self.by_scene, self.F)
         # The last gate of the submission: the competition refuses a whole file for one matrix.
         sources[~are_models(matrices)] = FALLBACK
         matrices[sources == FALLBACK] = FALLBACK_FUNDAMENTAL
@@ -229,36 +228,20 @@ class State:
     @property
     def scenes(self) -> dict[str, SceneRecord]:
         """The scene in use of each batch that has one."""
-        return {
-            batch: self.scene(number) for batch, number in self.batches.items() if self.made[number]
-        }
+        made = self.has_scene
+        return {name: self.scene(each) for name, each in self.batches.items() if made[each]}
 
     def scene(self, batch: int) -> SceneRecord:
         """Return the finished candidate with the smallest disagreement."""
-        made = self.made[batch]
-        named = {name: made[name].disagreement for name in self.candidates if name in made}
-        return made[best_of(named)]
-
-    def untried(self, batch: int) -> list[str]:
-        """Return the further candidates of a batch that are missing, once its first is today's; of a stale
-        batch all.
-        """
-        made = {} if self.stale[batch] else self.made[batch]
-        return [
-            name
-            for name in self.candidates[1:]
-            if name not in made and self.scene_losses[batch, name] < GIVEN_UP
-        ]
-
-    def may_make(self, batch: int) -> bool:
-        """Return whether the first scene of a batch is missing, and may be made."""
-        return bool(self.stale[batch]) and self.scene_losses[batch, ALL_UNITS] < GIVEN_UP
+        made = {each.candidate: each for each in self.made[batch] if each is not None}
+        best: SceneRecord = made[best_of({name: made[name].disagreement for name in made})]
+        return best
 
     def missing_scene(self, batch: str) -> str:
         """Return the reason why a batch has no scene."""
         number = self.batches[batch]
-        rows = self.members[number][self.members[number] < self.rows]
-        may_match = self.missing[rows].any() or self.matches[rows].any()
+        members = self.members[number]
+        may_match = (self.missing | (self.matches > 0))[members[members < self.rows]].any()
         return self.scene_failures.get(number, NOT_RECONSTRUCTED if may_match else NO_CAMERAS)
 
     @property
@@ -266,87 +249,76 @@ class State:
         """Whether something was given up. Unreadable images and matchers that cannot be loaded are facts of the
         input.
         """
-        refused = [unit.matcher in self.refused for unit in self.units]
-        is_lost = bool((self.losses >= GIVEN_UP).any() or (self.dead & ~np.array(refused)).any())
-        return is_lost or bool(self.scene_failures)
+        is_lost = (self.losses >= GIVEN_UP) & (self.losses < UNREADABLE)
+        is_dead = self.dead & (self.unit_losses < REFUSED)
+        return bool(is_lost.any() or is_dead.any() or self.scene_failures)
 
     # Keys of today
 
-    def images_of(self, index: int) -> Images | tuple[()]:
-        """Return both images of a pair, or an empty tuple if one is unknown."""
+    def images_of(self, index: int) -> Images:
         name0, name1 = self.names[index]
-        if name0 in self.images and name1 in self.images:
-            return self.images[name0], self.images[name1]
-        return ()
+        return self.images[name0], self.images[name1]
 
     def contents(self, index: int) -> str:
         """Return a text that identifies the contents of a pair's images."""
         return contents_of(self.images_of(index), self.pairs[index].turns)
 
     def key(self, index: int, unit: int) -> str:
-        """Return today's key of a unit's points on a pair whose images are known."""
-        images = self.images_of(index)
-        assert images
+        """Return today's key of a unit's points on a pair."""
         keys = self.request.keys
-        first: list[str] = []
-        if self.is_crop[unit]:
-            first = [keys.mkpc, *self.points_before(index, unit).values()]
-        return keys.of_points(unit, self.pairs[index], images, first)
+        first = [keys.mkpc, *self.points_before(index, unit).values()] if self.is_crop[unit] else []
+        return keys.of_points(unit, self.pairs[index], self.images_of(index), first)
 
     def points_before(self, index: int, unit: int) -> dict[Unit, str]:
         """Return the keys of the points of stage 1 that a unit's crops come from."""
-        chosen = self.done[index, :unit] & ~self.is_crop[:unit]
-        return self._keys(index, chosen)
+        return self._keys(index, self.done[index, :unit] & ~self.is_crop[:unit])
+
+    def points_in_use(self, index: int) -> dict[Unit, str]:
+        return self._keys(index, self.done[index] & self.needed[index])
 
     def _keys(self, index: int, chosen: Mask) -> dict[Unit, str]:
         """Return the keys of a pair's points of these units, in the recipe's order."""
         numbers = np.flatnonzero(chosen).tolist()
         return {self.units[number]: self.points[index, number].decode() for number in numbers}
 
-    def keys_in_use(self, index: int) -> list[str]:
-        """Return the keys of a pair's points in use, in the recipe's order."""
-        return list(self._keys(index, self.done[index] & self.needed[index]).values())
-
     def estimate_key(self, index: int) -> str:
         """Return the key of an estimate from the points in use."""
-        return self.request.keys.of_estimate(self.keys_in_use(index))
+        return self.request.keys.of_estimate(self.points_in_use(index).values())
 
-    def scene_inputs(self, batch: int) -> tuple[list[int], str]:
+    def inputs_of(self, index: int, points: Mapping[Unit, str] | None = None) -> PairInputs:
+        """Return the inputs of a pair's job: its points in use, or these ``points``."""
+        return PairInputs(
+            index,
+            self.pairs[index],
+            self.images_of(index),
+            self.points_in_use(index) if points is None else points,
+            self.estimate[index].decode(),
+            self.F[index] if self.has_f[index] else None,
+        )
+
+    def scene_inputs(self, batch: int) -> tuple[tuple[PairInputs, ...], str]:
         """Return the pairs of a batch that have points, and the key of a scene from them."""
         members = self.members[batch]
         # A pair without points adds nothing to a scene.
-        indices = members[self.used[members].any(1)].tolist()
-        inputs = [
-            [
-                self.names[index],
-                self.contents(index),
-                self.keys_in_use(index),
-                self.estimate[index].decode(),
-            ]
-            for index in indices
+        used = members[(self.done[members] & self.needed[members]).any(1)].tolist()
+        pairs = tuple(map(self.inputs_of, used))
+        facts = [
+            [*self.names[pair.index], pair.contents, [*pair.points.values()], pair.estimate]
+            for pair in pairs
         ]
-        return indices, self.request.keys.of_scene(inputs)
-
-    def inputs_of(self, index: int) -> PairInputs:
-        """Return the inputs of a pair's estimate, or of its batch's scene."""
-        images = self.images_of(index)
-        assert images
-        points = self._keys(index, self.done[index] & self.needed[index])
-        own = self.F[index] if self.has_f[index] else None
-        return PairInputs(index, images, points, own)
+        return pairs, self.request.keys.of_scene(facts)
 
     # Updates
 
     def restore(self, store: Store) -> None:
         """Use today's results of a store. It is the only time that it is read for the state."""
-        known = [index for index in range(len(self.pairs)) if self.images_of(index)]
-        # An extra pair has points of the sweeping unit, and no estimate. The store may have more, of another
-        # recipe, or of a run in which it was a row, and a scene must not depend on that.
-        rows = [index for index in known if index < self.rows]
-        # In the recipe's order, because the keys of crops depend on it
+        # In the recipe's order, because the keys of crops depend on it. An extra pair has points of the sweeping
+        # unit. The store may have more, of another recipe, or of a run in which it was a row, and a scene must not
+        # depend on that.
         for unit in range(len(self.units)):
-            self._restore_points(store, unit, known if unit == self.sweep else rows)
-        keys = {index: self.estimate_key(index) for index in rows if self.used[index].any()}
+            self._restore_points(store, unit, len(self.pairs) if unit == self.sweep else self.rows)
+        used = np.flatnonzero(self.used[: self.rows].any(1)).tolist()
+        keys = {index: self.estimate_key(index) for index in used}
         estimates = store.facts(keys.values())
         for index, key in keys.items():
             if key in estimates:
@@ -354,32 +326,26 @@ class State:
         for batch in range(len(self.batches)):
             self._restore_scenes(store, batch)
 
-    def _restore_points(self, store: Store, unit: int, indices: Sequence[int]) -> None:
-        mkpc = self.request.recipe.mkpc
-        keys = {index: self.key(index, unit) for index in indices}
+    def _restore_points(self, store: Store, unit: int, count: int) -> None:
+        keys = [self.key(index, unit) for index in range(count)]
         columns = "key, matches, scale, detail, data IS NOT NULL"
-        found = {key: row for key, *row in store.select("points", columns, keys.values())}
-        for index, key in keys.items():
-            if key not in found:
-                continue
-            matches, scale, detail, has_data = found[key]
+        stored = {key: row for key, *row in store.select("points", columns, keys)}
+        for index, key in enumerate(keys):
+            matches, scale, detail, has_data = stored.get(key, (0, 0.0, 0.0, None))
             # Under another rule than today's, the pair may have needed the unit, or not.
-            is_needed = not self.is_crop[unit] or pays(scale, detail, mkpc)
-            if has_data or not is_needed:
+            is_needed = not self.is_crop[unit] or pays(scale, detail, self.request.recipe.mkpc)
+            if has_data is not None and (has_data or not is_needed):
                 self.use_points(index, unit, key, matches, is_needed=is_needed)
 
     def _restore_scenes(self, store: Store, batch: int) -> None:
         _, first = self.scene_inputs(batch)
         folder = self.request.scenes_dir
-        keys = {name: of_candidate(first, name) for name in self.candidates}
-        # A scene without its folder is made again.
-        keys = {
-            name: key for name, key in keys.items() if folder is None or (folder / key).is_dir()
-        }
-        found = store.facts(keys.values())
-        for name, key in keys.items():
-            if key in found and (name == ALL_UNITS or not self.stale[batch]):
-                self.use_scene(batch, SceneRecord.from_json(found[key]), first)
+        keys = [of_candidate(first, name) for name in self.candidates]
+        records = store.facts(keys)
+        for key in keys:
+            # A scene without its folder is made again.
+            if key in records and (folder is None or (folder / key).is_dir()):
+                self.use_scene(batch, SceneRecord.from_json(records[key]), first)
 
     def use_points(
         self, index: int, unit: int, key: str, matches: int, *, is_needed: bool = True
@@ -389,8 +355,10 @@ class State:
         self.done[index, unit] = True
         self.needed[index, unit] = is_needed
         self.matches[index, unit] = matches if is_needed else 0
+        self.losses[index, unit] = 0
         if not self.is_crop[unit]:
-            later = np.flatnonzero(self.is_crop[unit + 1 :]) + unit + 1
+            later = self.is_crop.copy()
+            later[:unit] = False
             self.done[index, later] = False
             self.matches[index, later] = 0
         self.dirty[index] = True
@@ -405,6 +373,7 @@ class State:
         self.F[index] = np.reshape(facts["F"], (3, 3))
         self.has_f[index] = not facts["failure"]
         self.inliers[index] = sum(facts["inliers"].values())
+        self.losses[index, ESTIMATE] = 0
         self._note_change(index)
 
     def use_scene(self, batch: int, record: SceneRecord, first: str) -> None:
@@ -414,12 +383,13 @@ class State:
         used only if they are from the same results, and today's.
         """
         made = self.made[batch]
-        if record.candidate == ALL_UNITS:
-            made.clear()
+        number = self.candidates.index(record.candidate)
+        if number == 0:
+            made[:] = None
             self.stale[batch] = self.scene_inputs(batch)[1] != first
-        elif self.stale[batch] or ALL_UNITS not in made or made[ALL_UNITS].key != first:
+        elif self.stale[batch] or made[0].key != first:
             return
-        made[record.candidate] = record
+        made[number] = record
         scene = self.scene(batch)
         members = self.members[batch]
         self.dirty[members] = True
@@ -434,83 +404,59 @@ class State:
     def _note_change(self, index: int) -> None:
         """Note that a pair has other inputs for its scene than before: points, or an estimate."""
         self.dirty[index] = True
-        batch = self.batch_of[index]
+        batch = int(self.batch_of[index])
         if batch >= 0:
             self.stale[batch] = True
-            self.scene_failures.pop(int(batch), None)
-            for name in self.candidates:
-                del self.scene_losses[int(batch), name]
+            self.scene_losses[batch] = 0
+            self.scene_failures.pop(batch, None)
 
     # Jobs and failures
-
-    def columns_of(self, job: MatchJob | EstimateJob) -> list[int]:
-        """Return the columns of ``losses`` of a job."""
-        if isinstance(job, EstimateJob):
-            return [ESTIMATE]
-        return [self.number_of[unit.name] for unit in job.units]
 
     def release(self, job: Job) -> None:
         """Note that a job is not under way any more."""
         if isinstance(job, MatchJob):
-            self.busy[list(job.indices)] = NEVER
-        elif isinstance(job, EstimateJob):
-            self.estimating[job.indices] = False
+            self.busy[job.indices] = NEVER
+        elif isinstance(job, SceneJob):
+            self.making.discard(job.scene)
         else:
-            self.making.discard((self.batches[job.batch], job.candidate))
-
-    def has_losses(self, job: Job) -> bool:
-        """Return whether a pair of a job had a lost job of the same kind."""
-        if isinstance(job, SceneJob):
-            return False
-        losses = self.losses[list(job.indices)]
-        kind = losses[:, ESTIMATE] if isinstance(job, EstimateJob) else losses[:, :ESTIMATE]
-        return bool(kind.any())
+            self.estimating[job.indices] = False
 
     def note_reason(self, index: int, what: str, reason: str) -> None:
         self.reasons.setdefault(index, {})[what] = reason
         self.dirty[index] = True
 
     def note_unreadable(self, index: int, reason: str) -> None:
-        self.unreadable[index] = True
+        self.losses[index, :ESTIMATE] = UNREADABLE
         self.note_reason(index, "", reason)
 
-    def lose(self, job: MatchJob | EstimateJob, reason: str) -> list[tuple[int, str]]:
-        """Count a lost job of its pairs. Return the pairs and units that are given up now."""
-        given_up = []
-        for index, unit in product(job.indices, self.columns_of(job)):
-            if self.losses[index, unit] < GIVEN_UP:
-                self.losses[index, unit] += 1
-                if self.losses[index, unit] == GIVEN_UP:
-                    given_up.append((index, self.titles[unit]))
-                    self.note_reason(index, self.titles[unit], reason)
-        return given_up
+    def has_losses(self, job: Job) -> bool:
+        """Return whether a pair of a job had a lost job of the same kind."""
+        columns = slice(ESTIMATE) if isinstance(job, MatchJob) else ESTIMATE
+        return bool(self.losses[job.indices, columns].any())
 
-    def take_back(self, job: MatchJob | EstimateJob) -> None:
+    def cells(self, job: Job) -> tuple[NDArray[np.intp], ...]:
+        """Return the cells of ``losses`` of a job of pairs."""
+        columns = job.plan.units if isinstance(job, MatchJob) else [len(self.units)]
+        return np.ix_(job.indices, columns)
+
+    def lose(self, job: Job, reason: str) -> None:
+        """Count a lost job of its pairs."""
+        cells = self.cells(job)
+        self.losses[cells] += self.losses[cells] < GIVEN_UP
+        for index in job.indices:
+            for column in cells[1].ravel().tolist():
+                if self.losses[index, column] == GIVEN_UP:
+                    self.note_reason(index, self.titles[column], reason)
+
+    def take_back(self, job: Job) -> None:
         """Forget a lost job of a place that was at fault."""
-        for index, unit in product(job.indices, self.columns_of(job)):
-            if 0 < self.losses[index, unit] <= GIVEN_UP:
-                self.losses[index, unit] -= 1
-
-    def refuse(self, refused: Mapping[str, str]) -> None:
-        """Skip the units whose matchers cannot be loaded."""
-        self.refused |= refused
-        self.dead |= [unit.matcher in self.refused for unit in self.units]
-
-    def lose_scene(self, batch: int, candidate: str, reason: str) -> None:
-        """Count a lost job of a candidate."""
-        self.scene_losses[batch, candidate] += 1
-        if candidate == ALL_UNITS and not self.may_make(batch):
-            self.scene_failures[batch] = reason
-
-    def give_up_scenes(self, reason: str) -> None:
-        """Note that no worker reconstructs any more."""
-        for batch in np.flatnonzero(self.stale).tolist():
-            self.scene_failures.setdefault(batch, reason)
+        losses = self.losses[cells := self.cells(job)]
+        self.losses[cells] -= (losses > 0) & (losses <= GIVEN_UP)
 
     def begin_anew(self) -> None:
         """Forget the failures of the devices so far, and their jobs: another device takes over."""
-        self.losses[:, :-1] = 0
+        losses = self.losses[:, :ESTIMATE]
+        losses[losses < UNREADABLE] = 0
         self.busy[:] = NEVER
         self.unit_losses[:] = 0
         self.dead[:] = False
-        self.refused = {}

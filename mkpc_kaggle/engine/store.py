@@ -12,12 +12,13 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 from time import monotonic
 from typing import Any, Self
 
 from mkpc_kaggle.errors import UserError, printable, writing
-from mkpc_kaggle.geometry.critical_region import CriticalRegion
+from mkpc_kaggle.geometry.critical_region import CriticalRegion, to_json
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 
@@ -57,23 +58,19 @@ REVISION = 1
 STORE_FORMAT = zlib.crc32(f"{REVISION} {SCHEMA}".encode()) >> 1  # SQLite has 31 bits for it
 
 
-def points_row(key: str, found: UnitResult, regions: Sequence[CriticalRegion]) -> tuple[Any, ...]:
+def points_row(key: str, result: UnitResult, regions: Iterable[CriticalRegion]) -> tuple[Any, ...]:
     """Return the row of a unit's points on a pair. A unit that the pair does not need has no data."""
-    need = found.need
-    boxes = [
-        [*vars(region.box).values(), region.reason, region.clusters, region.kept]
-        for region in regions
-    ]
+    need = result.need
     return (
         key,
-        len(found.matches),
-        found.keypoints,
-        found.seconds,
+        len(result.matches),
+        result.keypoints,
+        result.seconds,
         None if need is None else need.scale,
         None if need is None else need.detail,
-        json.dumps(boxes) if boxes else "",
-        found.note,
-        found.matches.to_bytes() if found.is_needed else None,
+        to_json(regions) if result.unit.stage == 2 else "",
+        result.note,
+        result.matches.to_bytes() if result.is_needed else None,
     )
 
 
@@ -90,15 +87,7 @@ class Store:
         self.db = db
         self.trouble = ""
         self._lock: sqlite3.Connection | None = None
-        self._retry_at = 0.0  # on the monotonic clock
-
-    @classmethod
-    def in_memory(cls, directory: Path) -> Self:
-        """Return a store that leaves no file."""
-        store = cls(directory, connected(":memory:"))
-        create(store.db)
-        store.db.executescript(SPARE)
-        return store
+        self._retry_at = -inf  # on the monotonic clock
 
     @classmethod
     def open(cls, directory: Path, *, fresh: bool = False) -> Self:
@@ -127,14 +116,14 @@ class Store:
             try:
                 return cls(directory, checked(path, WRITE), path)
             except sqlite3.OperationalError as error:
-                trouble = f"the journal cannot be written ({error}); results stay in memory"
+                trouble = error
         # The results of earlier runs, if any
         try:
             store = cls(directory, checked(path, IMMUTABLE), path)
         except (sqlite3.OperationalError, UserError):
             store = cls(directory, connected(":memory:"))
             create(store.db)
-        store.trouble = trouble
+        store._note(trouble)
         return store
 
     @classmethod
@@ -176,37 +165,39 @@ class Store:
         again.
         """
         # Not with each answer, because waiting for a lock and writing many rows take time.
-        if not self.trouble or monotonic() >= self._retry_at:
+        if monotonic() >= self._retry_at:
             try:
-                with self.db:
-                    self.db.execute("BEGIN IMMEDIATE")
-                    for table in TABLES if self.trouble else ():
-                        self.db.execute(f"REPLACE INTO main.{table} SELECT * FROM spare.{table}")
-                        self.db.execute(f"DELETE FROM spare.{table}")
-                    self._insert("main", rows)
+                self._insert("main", rows)
             except sqlite3.DatabaseError as error:  # a full disk, a lock, a damaged file
-                self.trouble = f"the journal cannot be written ({error}); results stay in memory"
-                self._retry_at = monotonic() + RETRY_S
+                self._note(error)
             else:
-                if self.path is not None:
-                    self.trouble = ""
+                self._retry_at = -inf
+                self.trouble = ""
                 return
-        with self.db:
-            self.db.execute("BEGIN")
-            self._insert("spare", rows)
+        self._insert("spare", rows)
 
     def flush(self) -> str:
         """Try to write the rows that wait in memory. Return why the file does not have all results, or an
         empty text.
         """
-        self._retry_at = 0.0
+        if self.path is not None:
+            self._retry_at = -inf
         self.put({})
         return self.trouble
 
+    def _note(self, error: sqlite3.DatabaseError) -> None:
+        self.trouble = f"the journal cannot be written ({error}); results stay in memory"
+        self._retry_at = inf if self.path is None else monotonic() + RETRY_S
+
     def _insert(self, where: str, rows: Mapping[str, Iterable[Sequence[Any]]]) -> None:
-        for table, values in rows.items():
-            marks = ", ".join("?" * (TABLES[table].count(",") + 1))
-            self.db.executemany(f"REPLACE INTO {where}.{table} VALUES ({marks})", values)
+        with self.db:
+            self.db.execute("BEGIN")
+            for table in TABLES if where == "main" and self.trouble else ():
+                self.db.execute(f"REPLACE INTO main.{table} SELECT * FROM spare.{table}")
+                self.db.execute(f"DELETE FROM spare.{table}")
+            for table, values in rows.items():
+                marks = ", ".join("?" * (TABLES[table].count(",") + 1))
+                self.db.executemany(f"REPLACE INTO {where}.{table} VALUES ({marks})", values)
 
     # Reading
 
@@ -225,13 +216,14 @@ class Store:
         """Return results as JSON by key, if they exist."""
         return dict(self.select("result", "key, facts", keys))
 
-    def source(self, keys: Sequence[str]) -> "Source":
-        """Return where a worker finds the points with these keys."""
+    def source(self, keys: Sequence[str], *, is_sent: bool = False) -> "Source":
+        """Return where a worker finds the points with these keys; with ``is_sent``, the points themselves, for
+        another machine.
+        """
         held: dict[str, bytes] = {}
-        if self.path is None:
-            held = dict(self.select("points", "key, data", keys))
-        elif self.trouble:
-            held = dict(self.select("spare.points", "key, data", keys))
+        with suppress(UserError):  # a disk that fails costs the job: the worker reads, too
+            table = "points" if is_sent or self.path is None else "spare.points"
+            held = dict(self.select(table, "key, data", keys))
         return Source(self.path, held)
 
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from mkpc_kaggle.cores import limit_matching_threads, limit_to_one_thread
-from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image, ImageStore
 from mkpc_kaggle.engine.request import (
     Answer,
@@ -101,14 +100,13 @@ class MatchRunner:
         """Match the pairs of a job with each unit that is expected to end in time."""
         assert isinstance(job, MatchJob)
         # Durations and not moments in the job: other machines have other clocks.
-        deadline = time.monotonic() + job.seconds
-        expected = dict(zip(job.units, job.expected, strict=True))
+        deadline = time.monotonic() + job.plan.seconds
+        expected = dict(zip(job.units, job.plan.expected, strict=True))
 
         def may_start(unit: Unit, pairs: int) -> bool:
             return time.monotonic() + pairs * expected[unit] < deadline
 
-        given = job.given or [()] * len(job.pairs)
-        opened = list(map(self._open, job.pairs, job.digests, given))
+        opened = [self._open(*each) for each in with_points(job)]
         # Decoding the next pairs' images takes place while a GPU matches.
         self._images.prefetch(job.upcoming)
         # An unreadable image fails its pair alone, not the minibatch.
@@ -117,22 +115,21 @@ class MatchRunner:
         done = [pair if pair.failure else next(matched) for pair in opened]
         # Without the given points, and without pixels
         return tuple(
-            replace(pair, results=pair.results[len(before) :], images=())
-            for pair, before in zip(done, given, strict=True)
+            replace(pair, results=pair.results[len(given.points) :], images=())
+            for pair, given in zip(done, job.pairs, strict=True)
         )
 
-    def _open(
-        self, pair: Pair, digests: tuple[str, ...], given: tuple[UnitResult, ...]
-    ) -> PairMatch:
+    def _open(self, inputs: PairInputs, given: tuple[UnitResult, ...]) -> PairMatch:
         """Return a pair with its images; ``failure`` names an image that is unreadable, or has changed."""
         images = []
         failure = ""
-        for path, turns, digest in zip(pair.images, pair.turns, digests, strict=True):
+        pair = inputs.pair
+        for path, turns, known in zip(pair.images, pair.turns, inputs.images, strict=True):
             image = self._images.get(path).turned(turns)
             if not isinstance(image, Image):
                 failure = failure or str(image)
             # Otherwise wrong points would have a right key for ever.
-            elif image.version != digest:
+            elif image.version != known.digest:
                 failure = failure or f"{shown(path)}: changed during the run"
             else:
                 images.append(image)
@@ -154,7 +151,11 @@ def do_estimates_job(job: Job) -> tuple[Estimated, ...]:
 
 
 def estimate_pair(pair: PairInputs, results: tuple[UnitResult, ...], recipe: Recipe) -> Estimated:
-    """Estimate F of a pair from its points of all units."""
+    """Estimate F of a pair from its points of all units. The store has these facts.
+
+    ``F`` and ``magsac``, that before the prior, are nine numbers, row by row. ``inliers`` has a count for each key
+    of points.
+    """
     start = time.perf_counter()
     # From the digested contents, so the images are not decoded again.
     sizes = tuple(image.size for image in pair.images)
@@ -163,17 +164,14 @@ def estimate_pair(pair: PairInputs, results: tuple[UnitResult, ...], recipe: Rec
     found = with_estimate(match, recipe).estimate
     # The inliers of each unit, by the bounds of its matches among all
     counts = [len(result.matches) for result in results]
-    masks = np.split(found.inliers, np.cumsum(counts)[:-1])
-    inliers = tuple(int(mask.sum()) for mask in masks)
-    return Estimated(
-        tuple(pair.points.values()),
-        inliers,
-        found.matrix,
-        found.failure,
-        found.magsac,
-        found.stats,
-        time.perf_counter() - start,
-    )
+    inliers = [int(mask.sum()) for mask in np.split(found.inliers, np.cumsum(counts)[:-1])]
+    facts = {
+        "F": found.matrix.ravel().tolist(),
+        "failure": found.failure,
+        "magsac": None if found.magsac is None else found.magsac.ravel().tolist(),
+        "inliers": dict(zip(pair.points.values(), inliers, strict=True)),
+    }
+    return Estimated(facts, time.perf_counter() - start)
 
 
 def scene_runner() -> Runner:
@@ -185,14 +183,16 @@ def compute_scene(job: Job) -> Solution:
     """Return the reconstructions of a batch, and a choice for each pair. pycolmap may end the
     process.
     """
-    assert isinstance(job, SceneJob) and job.recipe.scene is not None
-    inputs = with_points(job)
-    is_whole = job.folder is not None
-    pairs = [batch_pair(*pair, keeps_paths=is_whole, candidate=job.candidate) for pair in inputs]
     recipe = job.recipe
+    assert isinstance(job, SceneJob) and recipe.scene is not None
+    is_whole = job.folder is not None
+    pairs = [
+        batch_pair(*pair, keeps_paths=is_whole, candidate=job.candidate)
+        for pair in with_points(job)
+    ]
     solution = reconstruct_batch(
         pairs,
-        candidate_settings(job.candidate, job.recipe.scene),
+        candidate_settings(job.candidate, recipe.scene),
         recipe.focal,
         recipe.magsac,
         job.folder,
@@ -223,9 +223,7 @@ def batch_pair(
     return BatchPair(image0, image1, by_unit, pair.own, candidate_tracks(results, candidate))
 
 
-def with_points(
-    job: EstimateJob | SceneJob,
-) -> list[tuple[PairInputs, tuple[UnitResult, ...]]]:
+def with_points(job: Job) -> list[tuple[PairInputs, tuple[UnitResult, ...]]]:
     """Return each pair of a job with the points of its units."""
     keys = [key for pair in job.pairs for key in pair.points.values()]
     points = job.source.matches(keys)

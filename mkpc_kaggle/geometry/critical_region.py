@@ -9,6 +9,8 @@ So ``eps``, 0.05 in all shipped recipes, is a share: of the width along x, and o
 points, points in one cell of a tenth of ``eps`` are merged first, weighted by their number.
 """
 
+import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -105,8 +107,24 @@ class CriticalRegion:
 
     box: Box
     reason: RegionReason
-    clusters: int = 0  # number of clusters found
-    kept: int = 0  # number of clusters inside the box
+
+
+def to_json(regions: Iterable[CriticalRegion]) -> str:
+    """Return regions as text, which :func:`from_json` reads."""
+    rows = []
+    for region in regions:
+        box = region.box
+        rows.append((box.left, box.top, box.right, box.bottom, region.reason))
+    return json.dumps(rows)
+
+
+def from_json(text: str) -> tuple[CriticalRegion, CriticalRegion] | None:
+    if not text:
+        return None
+    first, second = (
+        CriticalRegion(Box(*box), RegionReason(reason)) for *box, reason in json.loads(text)
+    )
+    return first, second
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,16 +180,14 @@ def critical_region(points: Points, size: Size, config: MkpcConfig) -> CriticalR
     if len(points) < config.min_samples:
         return CriticalRegion(whole, RegionReason.TOO_FEW_POINTS)
     clusters = find_clusters(points, size, config)
-    found = len(clusters.sizes)
-    kept = len(clusters.kept)
-    if not found:
+    if not len(clusters.sizes):
         return CriticalRegion(whole, RegionReason.NO_CLUSTER)
     if clusters.sizes.sum() / len(points) < config.min_clustered:
-        return CriticalRegion(whole, RegionReason.TOO_SCATTERED, found, kept)
+        return CriticalRegion(whole, RegionReason.TOO_SCATTERED)
     box = expand_box(points[clusters.in_kept], size, config.expand_x, config.expand_y)
     if min(box.size) < config.min_side:
-        return CriticalRegion(whole, RegionReason.TOO_SMALL, found, kept)
-    return CriticalRegion(box, RegionReason.CROPPED, found, kept)
+        return CriticalRegion(whole, RegionReason.TOO_SMALL)
+    return CriticalRegion(box, RegionReason.CROPPED)
 
 
 def find_clusters(points: Points, size: Size, config: MkpcConfig) -> Clusters:

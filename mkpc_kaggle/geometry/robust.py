@@ -96,6 +96,13 @@ class Estimate:
         return int(self.inliers.sum())
 
     @classmethod
+    def of_nearest(cls, F: Matrix3, matches: Matches, count: int, failure: str) -> "Estimate":
+        """Return an estimate whose inliers are the ``count`` matches that are nearest to F."""
+        inliers = np.zeros(len(matches), bool)
+        inliers[np.argsort(sampson_distances(F, matches), kind="stable")[:count]] = True
+        return cls(ModelKind.F, F, inliers, failure)
+
+    @classmethod
     def failed(cls, model: ModelKind, count: int, reason: str) -> "Estimate":
         """Return the fallback for ``count`` matches, with the reason."""
         return cls(model, unit_norm(_SOLVERS[model].fallback), np.zeros(count, bool), reason)

@@ -11,10 +11,10 @@ from pathlib import Path
 from mkpc_kaggle.config import decimal, whole
 from mkpc_kaggle.data.competition import CONTROL, read_rows
 from mkpc_kaggle.data.images import READ_SUFFIXES, read_size
-from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.errors import UserError, plural, printable, read_text
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, Rows
 from mkpc_kaggle.scene.models import MIN_IMAGES
+from mkpc_kaggle.setup.console import logger
 
 CAMERA_COLUMNS = ("image", "camera_model", "width", "height", "parameters")
 FOCALS = (0.1, 10.0)  # in long sides of the image, as in COLMAP's ``has_bogus_params``

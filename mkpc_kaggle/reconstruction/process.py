@@ -7,9 +7,9 @@ from math import inf
 from multiprocessing import get_context
 from typing import Any
 
-from mkpc_kaggle.engine.process import end_with_parent
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.failures import reason_of
+from mkpc_kaggle.signals import end_with_parent
 
 
 class Child:

@@ -13,7 +13,6 @@ from typing import Any
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.errors import UserError, plural, temporary_directory
@@ -33,6 +32,7 @@ from mkpc_kaggle.reconstruction.outputs import (
 from mkpc_kaggle.reconstruction.pairs import choose_pairs
 from mkpc_kaggle.scene.models import SfmModel
 from mkpc_kaggle.setup.assembly import Assembly, PathSource, Weights, assemble
+from mkpc_kaggle.setup.console import logger
 from mkpc_kaggle.signals import Interrupt, interruptible
 
 AUTO_RECIPE = "auto"  # the recipe of all matchers whose weights are found

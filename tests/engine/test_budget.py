@@ -11,9 +11,9 @@ from mkpc_kaggle.engine.budget import (
     Budget,
     Costs,
     monotonic_of,
-    parse_duration,
 )
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.progress import parse_duration
 
 
 @pytest.mark.parametrize(

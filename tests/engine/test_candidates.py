@@ -95,7 +95,7 @@ def test_a_candidate_that_is_lost_costs_itself_alone_and_the_next_run_tries_it_a
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
     assert numbers(report) == {4.0}
-    fault = f"batch one was not reconstructed by the tracks of {FIRST}"
+    fault = f"batch one by the tracks of {FIRST} was not reconstructed"
     assert any(each.startswith(fault) for each in report.about.faults)
     assert report.scenes["failure"].tolist() == [""]
     del made[:]

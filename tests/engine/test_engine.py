@@ -98,7 +98,7 @@ def test_a_finished_run_reads_no_image_and_loads_no_matcher_again(tmp_path, monk
     once = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     # Loading gigabytes of weights to find that nothing is missing would take minutes.
     monkeypatch.setattr(Pipeline, "load", lambda *_: pytest.fail("it is loaded"))
-    monkeypatch.setattr(keys, "_read_facts", lambda *_: pytest.fail("it is read"))
+    monkeypatch.setattr(keys, "image_facts", lambda *_: pytest.fail("it is read"))
     twice = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
 
     assert matrices(once) == matrices(twice)

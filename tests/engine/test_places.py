@@ -5,11 +5,13 @@ import threading
 from types import SimpleNamespace
 
 import pytest
+from store_room import RECIPE
 
 from mkpc_kaggle.engine import places
 from mkpc_kaggle.engine.places import Kind, LocalSite, Place
 from mkpc_kaggle.engine.process import ThreadWorker
-from mkpc_kaggle.engine.request import Cause, Failure, Loaded, MatchJob
+from mkpc_kaggle.engine.request import Cause, Failure, Loaded, MatchJob, MatchPlan
+from mkpc_kaggle.engine.store import Source
 from mkpc_kaggle.engine.worker import scene_runner
 from mkpc_kaggle.pipeline.pair import PairMatch
 
@@ -17,7 +19,7 @@ DONE = (PairMatch(failure="unreadable"),)
 
 
 def job():
-    return MatchJob([0], [], [], 1.0, [], [])
+    return MatchJob((), RECIPE, Source(), MatchPlan(0, [0], [], [], 1.0, []))
 
 
 def place_of(waiting):
@@ -87,10 +89,10 @@ def test_the_workers_of_a_machine_share_its_cores_on_gpus_too(
 @pytest.mark.parametrize(
     ("cores", "devices", "workers", "scenes"),
     [
-        (8, ("cpu",), None, (1, 8)),
-        (8, ("cuda:0",), None, (7, 8)),
-        (8, ("cuda:0", "cuda:1"), None, (6, 8)),
-        (1, ("cuda:0",), None, (1, 1)),
+        (8, ("cpu",), None, 1),
+        (8, ("cuda:0",), None, 7),
+        (8, ("cuda:0", "cuda:1"), None, 6),
+        (1, ("cuda:0",), None, 1),
     ],
 )
 def test_scenes_have_the_cores_that_matching_leaves_free_and_estimates_those_of_the_container(
@@ -101,9 +103,7 @@ def test_scenes_have_the_cores_that_matching_leaves_free_and_estimates_those_of_
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
     monkeypatch.setattr(os, "cpu_count", lambda: 64)  # of the whole machine
     site = LocalSite(assembly, workers, lambda: 0.0)
-    while_matching = site.scenes_at_a_time(is_matching=True)
-    afterwards = site.scenes_at_a_time(is_matching=False)
-    assert (while_matching, afterwards) == scenes
+    assert site.scenes_beside == scenes
     assert len(site.of(Kind.SCENE)) == cores
     assert len(site.of(Kind.ESTIMATE)) == max(1, cores // 4)
 
@@ -116,8 +116,8 @@ def test_the_cpu_that_takes_over_has_its_own_sizes_and_all_cores(monkeypatch):
     assembly = SimpleNamespace(devices=("cuda:0",), on=lambda *_: gpu, on_cpu=lambda: cpu)
     site = LocalSite(assembly, None, lambda: 0.0)
     assert [place.minibatch for place in site.of(Kind.MATCH)] == [8]
-    assert site.scenes_at_a_time(is_matching=True) == 7
+    assert site.scenes_beside == 7
     site.fall_back()
     assert [place.minibatch for place in site.of(Kind.MATCH)] == [1]
-    assert site.scenes_at_a_time(is_matching=True) == 1
+    assert site.scenes_beside == 1
     assert site.fallback == []

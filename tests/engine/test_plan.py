@@ -23,15 +23,8 @@ from store_room import keys_of
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine import plan as plan_module
 from mkpc_kaggle.engine.budget import Budget, Costs
-from mkpc_kaggle.engine.plan import (
-    Crew,
-    MatchPlan,
-    NextWork,
-    plan,
-    prefix_that_fits,
-    time_left,
-)
-from mkpc_kaggle.engine.request import Cause, Ending, Failure, Request
+from mkpc_kaggle.engine.plan import Crew, Plan
+from mkpc_kaggle.engine.request import Cause, Ending, Failure, MatchPlan, Request
 from mkpc_kaggle.engine.state import CONNECT, FILL, NEVER, RAISED, State
 from mkpc_kaggle.engine.state import SWEEP as SWEEPING
 from mkpc_kaggle.recipe import SceneConfig, Unit
@@ -79,8 +72,8 @@ class Planned:
         for unit in units:
             self.costs.observe(unit.name, 1.0)
 
-    def plan(self, now: float = 0.0, lost: int = 0) -> NextWork:
-        return plan(self.state, self.costs, self.budget, self.crew, now, lost)
+    def plan(self, now: float = 0.0, lost: int = 0) -> Plan:
+        return Plan(self.state, self.costs, self.budget, self.crew, now, lost)
 
     def next(self, now: float = 0.0) -> MatchPlan | None:
         """The next job of matching, which is under way then."""
@@ -106,14 +99,6 @@ class Planned:
             now += self.finish(job, inliers)
 
     @property
-    def left(self) -> float:
-        return time_left(self.state, self.costs, self.budget, self.crew, 0.0)
-
-    @property
-    def fit(self) -> int:
-        return prefix_that_fits(self.state, self.state.missing, self.costs, self.crew, self.left)
-
-    @property
     def is_complete(self) -> bool:
         return not self.state.missing[: self.state.rows].any()
 
@@ -137,7 +122,12 @@ def test_the_plan_has_no_memory_and_changes_nothing():
     arrays = {k: v for k, v in vars(run.state).items() if isinstance(v, np.ndarray)}
     before = {name: array.copy() for name, array in arrays.items()}
     # A plan that is not carried out, because no worker is idle, must leave no trace.
-    assert run.plan() == run.plan()
+    first, second = run.plan(), run.plan()
+    assert (first.match, first.estimates, first.scenes) == (
+        second.match,
+        second.estimates,
+        second.scenes,
+    )
     for name, value in before.items():
         np.testing.assert_array_equal(getattr(run.state, name), value)
 
@@ -165,7 +155,9 @@ def test_a_minibatch_has_pairs_that_lack_the_same_units():
 def test_near_the_end_a_minibatch_gets_as_small_as_the_time_that_is_left():
     run = Planned(30, limit=100.0, had=[(SWEEP,)] * 30, minibatch=8)
     run.learn(*UNITS)
-    sizes = [len(run.plan(run.left - left).match.pairs) for left in (50.0, 9.5, 8.5, 5.5, 1.5)]
+    sizes = [
+        len(run.plan(run.plan().left - left).match.pairs) for left in (50.0, 9.5, 8.5, 5.5, 1.5)
+    ]
     assert sizes == [8, 8, 8, 5, 1]
 
 
@@ -249,12 +241,12 @@ def test_a_first_scene_waits_for_the_units_that_fit_and_a_later_scene_for_all():
     # The third unit does not fit for all pairs; many measurements, so that the forecast is certain.
     for _ in range(1000):
         run.costs.observe(THIRD.name, 400.0)
-    assert run.plan().scenes == [(0, "")]
-    run.state.made[0] = {"": None}
+    assert run.plan().scenes == [(0, 0)]
+    run.state.made[0, 0] = True
     assert run.plan().scenes == []
     run.crew = replace(run.crew, matchers=0)
     run.state.losses[:, 2] = RAISED
-    assert run.plan().scenes == [(0, "")]
+    assert run.plan().scenes == [(0, 0)]
 
 
 def test_a_first_scene_does_not_wait_for_a_job_that_hangs_until_the_end():
@@ -262,10 +254,10 @@ def test_a_first_scene_does_not_wait_for_a_job_that_hangs_until_the_end():
     run.state.estimated[:] = run.state.has_f[:] = True
     run.learn(*UNITS)
     run.state.busy[5] = SWEEPING
-    stop = run.left
+    stop = run.plan().left
     assert run.plan(stop - 1.0).scenes == []
-    assert run.plan(stop).scenes == [(0, "")]
-    run.state.made[0] = {"": None}  # a later scene needs all points
+    assert run.plan(stop).scenes == [(0, 0)]
+    run.state.made[0, 0] = True  # a later scene needs all points
     assert run.plan(stop).scenes == []
 
 

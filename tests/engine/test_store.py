@@ -141,7 +141,7 @@ def test_a_lock_of_another_program_is_waited_for_once_in_half_a_minute(
     monkeypatch.setattr("mkpc_kaggle.engine.store.monotonic", lambda: clock[0])
     with Store.open(tmp_path) as store, closing(connected(tmp_path / FILE_NAME)) as other:
         tried = []
-        store.db.set_trace_callback(lambda text: tried.append("IMMEDIATE" in text))
+        store.db.set_trace_callback(lambda text: tried.append("INTO main" in text))
         other.execute("BEGIN IMMEDIATE")
         for number in range(60):
             clock[0] = float(number)

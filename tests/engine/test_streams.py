@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from mkpc_kaggle.engine.console import (
+from mkpc_kaggle.setup.console import (
     LOG_NAME,
     Progress,
     logged,
@@ -54,7 +54,7 @@ def test_output_of_native_code_in_a_worker_goes_to_a_file_of_the_run(tmp_path):
 
 
 UNREAD = """
-from mkpc_kaggle.engine.console import Progress, leave, logger, queued
+from mkpc_kaggle.setup.console import Progress, leave, logger, queued
 
 with queued():
     progress = Progress()

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from mkpc_kaggle.engine.budget import COST_OF_ESTIMATES, Budget, Costs, start_limit, time_limit
-from mkpc_kaggle.engine.request import EstimateJob, Job, MatchJob, SceneJob
-from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.engine.request import EstimateJob, Job, MatchJob, MatchPlan, SceneJob
+from mkpc_kaggle.recipe import Recipe, Unit
 
 HOURS = 9 * 3600.0
 UNIT = Unit(1, "sift", 640)
@@ -15,11 +15,12 @@ SOME: Any = None  # which no limit depends on
 
 
 def matching(pairs: int) -> MatchJob:
-    return MatchJob(range(pairs), [UNIT], [0.0], 100.0, [], [])
+    plan = MatchPlan(0, [], [0], [0.0], 100.0, [])
+    return MatchJob((SOME,) * pairs, Recipe((UNIT,)), SOME, plan)
 
 
 def scene(matches: int) -> SceneJob:
-    return SceneJob("batch", "key", (), (), SOME, SOME, matches)
+    return SceneJob((), SOME, SOME, (0, 0), "batch", "", "key", "key", matches)
 
 
 def estimates(pairs: int) -> EstimateJob:

@@ -1,13 +1,27 @@
 """A worker of matching, without an engine: which units of a job it begins."""
 
+from dataclasses import replace
+
 import pytest
 from faulty import NarrowMatcher
-from rectified import SWEEP, THREE_UNITS
+from rectified import THREE_UNITS
 
 from mkpc_kaggle.data.images import content_digest
-from mkpc_kaggle.engine.request import MatchJob
+from mkpc_kaggle.engine.request import MatchJob, MatchPlan, PairInputs
+from mkpc_kaggle.engine.store import Source
 from mkpc_kaggle.engine.worker import MatchRunner
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.scene.view_graph import BatchImage
+
+
+def job_of(pairs, plan):
+    """A job of a plan on pairs whose images are as they are stored."""
+    inputs = []
+    for index, pair in enumerate(pairs):
+        images = [BatchImage(path.name, content_digest(path), Size(1, 1)) for path in pair.images]
+        inputs.append(PairInputs(index, pair, tuple(images), {}))
+    return MatchJob(tuple(inputs), THREE_UNITS, Source(), plan)
 
 
 @pytest.mark.parametrize(
@@ -28,15 +42,7 @@ def test_a_minibatch_that_would_not_end_in_time_gets_smaller_or_does_not_begin(
         lambda: Pipeline(THREE_UNITS, {matcher.name: matcher}.__getitem__, minibatch=8),
         is_limited=False,
     )
-    job = MatchJob(
-        range(8),
-        [SWEEP],
-        expected=[1e5],
-        seconds=seconds,
-        pairs=pairs[:8],
-        digests=[tuple(map(content_digest, pair.images)) for pair in pairs[:8]],
-    )
-    answer = runner(job)
+    answer = runner(job_of(pairs[:8], MatchPlan(0, [*range(8)], [0], [1e5], seconds, [])))
     assert matcher.sizes == sizes
     assert sum(bool(outcome.results) for outcome in answer) == sum(sizes)
 
@@ -46,9 +52,9 @@ def test_an_image_that_changed_since_the_run_read_it_fails_its_pair_alone(pairs)
     runner = MatchRunner(
         lambda: Pipeline(THREE_UNITS, {matcher.name: matcher}.__getitem__), is_limited=False
     )
-    digests = [tuple(map(content_digest, pair.images)) for pair in pairs[:2]]
-    digests[0] = (digests[0][0], "other")
-    job = MatchJob(range(2), [SWEEP], [0.0], 1e6, pairs[:2], digests)
-    changed, good = runner(job)
+    job = job_of(pairs[:2], MatchPlan(0, [0, 1], [0], [0.0], 1e6, []))
+    first, second = job.pairs
+    known = (first.images[0], replace(first.images[1], digest="other"))
+    changed, good = runner(replace(job, pairs=(replace(first, images=known), second)))
     assert changed.failure.endswith(": changed during the run")
     assert (changed.results, len(good.results)) == ((), 1)

@@ -4,13 +4,13 @@ import json
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from store_room import memory_store
+
 from mkpc_kaggle.engine.frames import Results, results_of
 from mkpc_kaggle.engine.request import About
-from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.scene.records import SceneRecord
 
@@ -70,7 +70,7 @@ def tables_of(
     digests: Mapping[str, str] = MappingProxyType({}),
 ) -> Results:
     """Return the tables of these pairs and scenes; ``digests`` are of images by name."""
-    store = Store.in_memory(Path())
+    store = memory_store()
     with closing(store.db):
         for number, each in enumerate(described):
             store.put(each.rows(number))

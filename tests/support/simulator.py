@@ -11,11 +11,10 @@ import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from store_room import facts_of, memory_store
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine import budget, plan
@@ -49,6 +48,7 @@ from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.sfm import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage
+from mkpc_kaggle.setup.console import Progress
 
 RESTART_S = 8.0  # imports and loading of a worker, about as long as with torch
 ESTIMATE_S = 0.1  # of a pair
@@ -281,7 +281,8 @@ class SimulatedSite(Site):
         if scenario.fallback:
             self.fallback = [Place("cpu", self.fallback_worker)]
 
-    def scenes_at_a_time(self, *, is_matching: bool) -> int:
+    @property
+    def scenes_beside(self) -> int:
         return self.scenario.scene_places
 
     def match_worker(self, *, is_bad: bool = False) -> "SimulatedWorker":
@@ -346,14 +347,14 @@ class SimulatedSite(Site):
 
     def match(self, warm: set[str], job: MatchJob) -> Drawn:
         """Draw the answer of a worker that ran the units of ``warm`` before; none begins after
-        ``job.seconds``.
+        ``seconds`` of the plan.
         """
         scenario = self.scenario
         rng = self.rng
         begun = self.clock.now
         spent = 0.0
         stalled = 0.0
-        expected = dict(zip(job.units, job.expected, strict=True))
+        expected = dict(zip(job.units, job.plan.expected, strict=True))
         if rng.random() < scenario.job_faults:
             fate = rng.integers(3)
             if fate == 0:
@@ -371,7 +372,7 @@ class SimulatedSite(Site):
                 if unit.stage == 2 and not scenario.needs_crops(index):
                     rows.append(UnitResult(unit, Matches.empty(), need=CropNeed(False)))
                     continue
-                if spent + expected[unit] >= job.seconds:
+                if spent + expected[unit] >= job.plan.seconds:
                     continue  # as a real worker, which begins no unit that would end too late
                 slow = STALL if rng.random() < scenario.stalls else 1.0
                 undisturbed = self.unit_seconds(unit, begun + spent)
@@ -399,9 +400,8 @@ class SimulatedSite(Site):
             return 0.0 if rng.random() < 0.5 else math.inf, Failure(Cause.DIED), 0.0
         estimates = []
         for pair in job.pairs:
-            inliers = (20 + pair.index % 60,) * len(pair.points)
-            points = tuple(pair.points.values())
-            estimates.append(Estimated(points, inliers, FALLBACK_FUNDAMENTAL, seconds=ESTIMATE_S))
+            inliers = dict.fromkeys(pair.points.values(), 20 + pair.index % 60)
+            estimates.append(Estimated(facts_of(inliers), ESTIMATE_S))
         return ESTIMATE_S * len(estimates), tuple(estimates), 0.0
 
     def reconstruct(self, job: SceneJob) -> Drawn:
@@ -434,6 +434,8 @@ class SimulatedWorker:
         self._draw = draw
         self._start_s = start_s
         self._answer: Answer = Loaded()
+        self._is_loaded = False
+        self._waiting: Job | None = None  # until then
         self._begun = self._fault = 0.0
 
     def start(self) -> None:
@@ -447,6 +449,9 @@ class SimulatedWorker:
             site.faults += max(0.0, min(self._start_s, site.stop - site.clock.now))
 
     def submit(self, job: Job) -> None:
+        if not self._is_loaded:
+            self._waiting = job
+            return
         self._begun = self._site.clock.now
         taken, self._answer, self._fault = self._draw(job)
         self.ready = self._begun + taken
@@ -459,7 +464,12 @@ class SimulatedWorker:
             site.kept += max(0.0, min(self.ready, site.stop) - self._begun)
             site.last_job = self.ready
         self.ready = math.inf
-        return self._answer
+        answer = self._answer
+        self._is_loaded = True
+        if self._waiting is not None:
+            job, self._waiting = self._waiting, None
+            self.submit(job)
+        return answer
 
     def kill(self) -> None:
         """End the worker, which died, hangs, or computes."""
@@ -470,14 +480,6 @@ class SimulatedWorker:
         if self._start_s and (is_stalled or isinstance(self._answer, Failure)):
             lost = min(self._fault, site.clock.now - self._begun)
             site.faults += max(0.0, min(lost, site.stop - self._begun))
-
-
-def memory_store() -> Store:
-    """A store that leaves no file."""
-    with TemporaryDirectory() as directory:
-        store = Store.in_memory(Path(directory))
-        weakref.finalize(store, store.db.close)  # since 3.13, Python warns of open connections
-        return store
 
 
 @dataclass(frozen=True)
@@ -526,13 +528,15 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
     names = {name for pair in pairs for name in (pair.file0, pair.file1)}
     published: list[int] = []
     interrupt = threading.Event()
-    store = memory_store() if store is None else store
+    if store is None:
+        store = memory_store()
+        weakref.finalize(store, store.db.close)  # since 3.13, Python warns of open connections
     publish = lambda state: published.append(len(state.fundamentals))  # noqa: E731
     about = About({"scene": {}} if scenario.batches else {})
     request = Request(pairs, scenario.recipe, scenario.keys, about=about, publish=publish)
     state = State(request, {name: BatchImage(name, name, SIZE) for name in names}, {})
     state.restore(store)
-    run = Run(state, site, store, time, interrupt=interrupt, progress=False)
+    run = Run(state, site, store, time, interrupt, Progress(is_shown=False))
 
     def wait(moment: float) -> None:
         whole_wait(min(moment, until))
@@ -556,7 +560,7 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
     sweep_fits = sweep_seconds(scenario) < SWEEP_SHARE * scenario.limit
     given = scenario.workers * (site.stop - RESTART_S) - site.faults
     faulty = {scene.batch for scene in site.scenes if scene.is_faulty}
-    matches = zip(state.batches, state.matches_of_batches, strict=True)
+    matches = zip(state.batches, state.by_batch(state.matches.sum(1)), strict=True)
     matched = {batch for batch, count in matches if count}
     made = set(report.pairs.query("choice != ''")["group"])
     missed = matched - faulty - made

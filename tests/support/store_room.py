@@ -2,6 +2,8 @@
 
 import threading
 from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rectified import SECOND, SWEEP, THREE_UNITS
@@ -15,28 +17,32 @@ from mkpc_kaggle.engine.request import (
     Estimated,
     EstimateJob,
     MatchJob,
+    MatchPlan,
     Request,
     SceneJob,
 )
 from mkpc_kaggle.engine.run import Run
+from mkpc_kaggle.engine.state import SWEEP as SWEEPING
 from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.engine.store import Source, Store
+from mkpc_kaggle.engine.store import SPARE, Source, Store, connected, create
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.crop_need import CropNeed
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, SfmModel
 from mkpc_kaggle.scene.sfm import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage
+from mkpc_kaggle.setup.console import Progress
 
 # Of rank 2
 F = np.array([[1.0, 2, 3], [4, 5, 6], [7, 8, 9]])
 REGIONS = (
-    CriticalRegion(Box(1, 2, 30, 40), RegionReason.CROPPED, 3, 2),
+    CriticalRegion(Box(1, 2, 30, 40), RegionReason.CROPPED),
     CriticalRegion(Box(0, 0, 5, 6), RegionReason.TOO_SMALL),
 )
 RECIPE = Recipe((SWEEP, SECOND), scene=SceneConfig(pairs_per_image=0), mkpc=THREE_UNITS.mkpc)
@@ -72,6 +78,22 @@ def state_of(
     return State(Request(pairs, recipe, keys_of(recipe, **other), about=about), images, {})
 
 
+def memory_store(directory: Path = Path()) -> Store:
+    """A store that leaves no file."""
+    store = Store(directory, connected(":memory:"))
+    create(store.db)
+    store.db.executescript(SPARE)
+    return store
+
+
+def facts_of(
+    inliers: dict[str, int], F: Any = FALLBACK_FUNDAMENTAL, magsac: Any = None
+) -> dict[str, object]:
+    """The facts of an estimate."""
+    magsac = None if magsac is None else magsac.ravel().tolist()
+    return {"F": F.ravel().tolist(), "failure": "", "magsac": magsac, "inliers": inliers}
+
+
 class Room:
     """A store, and a run of some pairs, whose answers are given by the test."""
 
@@ -95,8 +117,8 @@ class Room:
         self.state.restore(self.store)
         budget = Budget(0.0)
         site = Site(budget.clock)
-        interrupt = threading.Event()
-        self.run = Run(self.state, site, self.store, budget, interrupt=interrupt, progress=False)
+        progress = Progress(is_shown=False)
+        self.run = Run(self.state, site, self.store, budget, threading.Event(), progress)
 
     def match(self, index: int, *units: Unit, need: CropNeed | None = None) -> None:
         """Save points of a pair."""
@@ -104,19 +126,20 @@ class Room:
             UnitResult(unit, matches_of(index), 0.5, 0.25, need=need if unit.stage == 2 else None)
             for unit in units
         )
-        job = MatchJob([index], units, [0.0] * len(units), 0.0, [self.state.pairs[index]], [])
+        plan = MatchPlan(SWEEPING, [index], [], [], 0.0, [])
+        inputs = self.state.inputs_of(index)
+        job = MatchJob((inputs,), self.state.request.recipe, Source(), plan)
         self.run.save(job, (PairMatch(found, REGIONS),), 0.5)
 
     def estimate(self, index: int) -> None:
         inputs = self.state.inputs_of(index)
-        keys = tuple(inputs.points.values())
-        found = Estimated(keys, tuple(range(7, 7 + len(keys))), F, magsac=2 * F)
+        inliers = {key: 7 + number for number, key in enumerate(inputs.points.values())}
         job = EstimateJob((inputs,), self.state.request.recipe, Source())
-        self.run.save(job, (found,), 0.5)
+        self.run.save(job, (Estimated(facts_of(inliers, F, 2 * F)),), 0.5)
 
     def reconstruct(self) -> None:
         state = self.state
-        indices, key = state.scene_inputs(0)
+        pairs, key = state.scene_inputs(0)
         placed = [
             RegisteredImage(BatchImage(name, name, Size(80, 60)), CAMERA, 9)
             for name in ("0.png", "1.png")
@@ -124,13 +147,11 @@ class Room:
         model = SfmModel(tuple(placed), np.array([[0.0, 0.0, 5.0]]), 0.7)
         choices = [
             Choice(3 * F, Reason.SCENE),
-            *[Choice(None, Reason.UNREGISTERED)] * (len(indices) - 1),
+            *[Choice(None, Reason.UNREGISTERED)] * (len(pairs) - 1),
         ]
         answer = Solution((Reconstruction(("0.png", "1.png"), (model,)),), tuple(choices))
-        pairs = tuple(map(state.inputs_of, indices))
-        contents = tuple(map(state.contents, indices))
         recipe = state.request.recipe
-        job = SceneJob("one", key, pairs, contents, recipe, Source(), 60, scene=key)
+        job = SceneJob(pairs, recipe, Source(), (0, 0), "one", "", key, key, 60)
         self.run.save(job, answer, 1.5)
 
     def publish(self) -> None:
