@@ -45,9 +45,7 @@ def main() -> None:
         with Store.open(Path(directory)) as store:
             state = restored(scenario, store)
         resuming, resuming_cpu = time.perf_counter() - started, time.process_time() - cpu
-    what = (
-        f"{int(state.complete.sum())} pairs, {arguments.units} units of {arguments.matches} matches"
-    )
+    what = f"{int(state.estimated.sum())} pairs, {arguments.units} units of {arguments.matches} matches"
     print(f"{what}, {len(ran.scenes)} scenes: {ran.report.ending}")
     print(f"CPU: {1e3 * seconds / arguments.pairs:.2f} ms a pair; store: {size / 1e6:.0f} MB")
     stale = f"{state.stale.sum()} scenes out of date"

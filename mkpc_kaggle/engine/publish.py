@@ -7,7 +7,6 @@ from dataclasses import asdict
 import numpy as np
 
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.request import About
 from mkpc_kaggle.engine.state import FALLBACK, SOURCES, State
 from mkpc_kaggle.engine.store import Store
 
@@ -17,30 +16,40 @@ TIME_SHARE = 0.05  # maximum share of the time for writing versions, if a disk i
 
 class Publication:
     """The versions of a request's results. The loop publishes; the watchdog may save the last
-    version from its own thread. ``unwritten`` says why the latest version could not be written.
+    version from its own thread.
     """
 
     def __init__(self, state: State, store: Store, budget: Budget) -> None:
         self._state = state
         self._store = store
         self._budget = budget
+        self._about = state.request.about
         self._lock = threading.Lock()
         self._has_ended = False
         self._published = budget.clock()
-        self.unwritten = ""
 
     def is_due(self, now: float) -> bool:
         interval = max(INTERVAL_S, self._budget.writing / TIME_SHARE)
         return now - self._published > interval
 
-    def publish(self, about: About, *, is_last: bool = False) -> None:
+    def publish(self, *, is_last: bool = False) -> None:
         """Write the results, and the rows of the pairs that have changed since the last version. After the last
         one, the watchdog writes no other.
         """
         start = self._budget.clock()
         self.save()
-        run = (0, len(self._state.pair_of_row), json.dumps(self._facts(about)))
-        self._store.put({"pair": self._rows(), "run": [run]})
+        state = self._state
+        about = self._about
+        about.seconds = self._budget.spent()
+        about.failures = list(state.scene_failures.values())
+        # The key of each batch's scene, and the reason if it has none
+        made = state.scenes
+        keys = [made[batch].key if batch in made else "" for batch in state.batches]
+        scenes = list(zip(state.batches, keys, state.scene_reasons, strict=True))
+        facts = json.dumps({**asdict(about), "scenes": scenes})
+        rows = self._rows()
+        self._store.put({"pair": rows, "run": [(0, len(state.pair_of_row), facts)]})
+        about.unsaved = self._store.trouble
         # The measured time decides when the last version is written.
         self._published = self._budget.clock()
         self._budget.note_write(self._published - start)
@@ -53,18 +62,11 @@ class Publication:
             if not self._has_ended:
                 try:
                     self._state.request.publish(self._state)
-                    self.unwritten = ""
+                    self._about.unwritten = ""
                 # A full disk must not end the run; other errors are bugs and do.
                 except OSError as error:
-                    self.unwritten = f"the results cannot be written: {error}"
-        return self.unwritten
-
-    def _facts(self, about: About) -> dict[str, object]:
-        state = self._state
-        # The key of each batch's scene, and the reason if it has none
-        keys = {batch: scene.key for batch, scene in state.scenes.items()}
-        scenes = [(each, keys.get(each, ""), state.missing_scene(each)) for each in state.batches]
-        return {**asdict(about), "scenes": scenes}
+                    self._about.unwritten = f"the results cannot be written: {error}"
+        return self._about.unwritten
 
     def _rows(self) -> list[tuple[object, ...]]:
         """Return the rows of the pairs that have changed."""
@@ -77,26 +79,25 @@ class Publication:
         rows: list[tuple[object, ...]] = []
         for number in changed:
             index = int(state.pair_of_row[number])
-            pair = state.pairs[index]
-            scene = scenes.get(pair.group)
-            choice = scene.choices.get(state.contents(index)) if scene is not None else None
-            reasons = state.reasons.get(index, {})
+            batch = state.pairs[index].group
+            choices = scenes[batch].choices if batch in scenes else {}
+            choice = choices.get(state.contents(index))
             # An error counts if it left the pair without an F.
             is_lost = sources[number] == FALLBACK and not pending[index]
-            rows.append(
-                (
-                    number,
-                    state.request.pairs[number].id,
-                    pair.group,
-                    *state.names[index],
-                    json.dumps(self._units(index)),
-                    state.estimate[index].decode(),
-                    np.asarray(fundamentals[number], "<f8").tobytes(),
-                    SOURCES[sources[number]],
-                    "" if choice is None else choice.reason,
-                    next(iter(reasons.values()), "") if is_lost else "",
-                )
+            reasons = state.reasons.get(index, {}) if is_lost else {}
+            row = (
+                number,
+                state.request.pairs[number].id,
+                batch,
+                *state.names[index],
+                json.dumps(self._units(index)),
+                state.estimate[index].decode(),
+                np.asarray(fundamentals[number], "<f8").tobytes(),
+                SOURCES[sources[number]],
+                "" if choice is None else choice.reason,
+                next(iter(reasons.values()), ""),
             )
+            rows.append(row)
         return rows
 
     def _units(self, index: int) -> list[tuple[str, str, bool, str]]:

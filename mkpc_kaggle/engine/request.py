@@ -43,9 +43,9 @@ class Ending(StrEnum):
         return self in (Ending.COMPLETE, Ending.WITH_FAILURES)
 
 
-@dataclass(frozen=True)
+@dataclass
 class About:
-    """Facts for reports about the run that wrote the store.
+    """Facts for reports about the run that wrote the store, so far.
 
     ``resumed`` is the number of pairs that earlier runs finished. ``faults`` are lost jobs, places and units that
     were closed, and unwritten files. ``failures`` are the reasons of batches that were given up.
@@ -65,7 +65,7 @@ class About:
     resumed: int = 0
     units_run: int = 0
     estimated: int = 0
-    faults: Sequence[str] = ()
+    faults: list[str] = field(default_factory=list)
     failures: Sequence[str] = ()
     unwritten: str = ""  # why the last version of the results could not be written
     unsaved: str = ""  # why the journal does not have all results

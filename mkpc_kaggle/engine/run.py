@@ -9,7 +9,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
-from typing import Self, cast
+from typing import cast
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from mkpc_kaggle.engine.places import Kind, Place, Site
 from mkpc_kaggle.engine.plan import Crew, Plan, is_complete
 from mkpc_kaggle.engine.publish import Publication
 from mkpc_kaggle.engine.request import (
-    About,
     Answer,
     Cause,
     Ending,
@@ -35,7 +34,6 @@ from mkpc_kaggle.engine.request import (
     SceneJob,
 )
 from mkpc_kaggle.engine.state import (
-    DEEPEN,
     ESTIMATE,
     GIVEN_UP,
     NEVER,
@@ -61,9 +59,7 @@ MAX_FAULTS = 1000  # with different texts
 
 
 class Run:
-    """A run from a restored state. Setting ``interrupt`` ends it early. Leaving the context ends the workers
-    and publishes.
-    """
+    """A run from a restored state. Setting ``interrupt`` ends it early. ``about`` has its counts and faults."""
 
     def __init__(
         self,
@@ -81,38 +77,35 @@ class Run:
         self.interrupt = interrupt
         # By this run's answers alone: another machine may have computed the stored results.
         self.costs = Costs()
-        self.faults: list[str] = []
-        self.units_run = self.estimated = 0
-        self.resumed = int(state.complete.sum())
+        self.about = state.request.about
+        self.about.resumed = int((state.done.all(1) & state.estimated)[: state.rows].sum())
         self.publication = Publication(state, store, budget)
         self._progress = progress
-        self._explained = ""  # the phase that was explained last
+        self._phase = NEVER  # that was logged last
         self._has_loaded = False  # some worker of matching was ready
-        self._has_ended = False
         # For the report: an interrupted program has two seconds for it, and the import takes one.
         import_module("pandas")
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.end()
-
-    def end(self) -> None:
-        """End all workers, and publish for the last time."""
-        if not self._has_ended:  # report() and leaving the context both end the run
-            self._has_ended = True
+    def report(self) -> Results:
+        """Run, end all workers, and publish for the last time. Return the results."""
+        try:
+            self.run()
+        finally:
             self.site.close()
-            self.state.making.clear()
             self._progress.close()
-            self._publish()
+            self.about.ending = self.ending
+            self._publish(is_last=True)
+        self.about.unsaved = self.store.flush()  # the disk may have room again
+        self.fault(self.about.unsaved)
+        # Facts that a full disk kept from the store
+        return replace(results_of(self.store), about=self.about)
 
     # The loop
 
     def run(self) -> None:
-        if self.resumed:
+        if self.about.resumed:
             pairs = plural(self.state.rows, "pair")
-            self._say(f"{self.resumed} of {pairs} from earlier runs")
+            self._say(f"{self.about.resumed} of {pairs} from earlier runs")
         self._publish()
         while not self.budget.is_over(self.interrupt):
             now = self.budget.clock()
@@ -187,7 +180,7 @@ class Run:
                 plan = self.plan(now, len(place.lost))
             has_work = plan.match is not None
             if plan.match is not None and place.is_idle:
-                self._show(plan)
+                self._show(plan.phase)
                 job = self._match_job(plan.match)
         if job is not None:
             place.submit(job, now)
@@ -275,7 +268,7 @@ class Run:
                 # A unit that the pair does not need took no time.
                 if result.is_needed:
                     self.costs.observe(result.unit.name, result.seconds, warm_up=result.warm_up)
-                    self.units_run += 1
+                    self.about.units_run += 1
         self.store.put({"points": rows})
 
     def _save_estimates(self, job: Job, answer: Sequence[Estimated]) -> None:
@@ -288,12 +281,11 @@ class Run:
             state.use_estimate(pair.index, key, estimate.facts)
             self.costs.observe(COST_OF_ESTIMATES, estimate.seconds)
         self.store.put({"result": rows})
-        self.estimated += len(answer)
+        self.about.estimated += len(answer)
         # While pairs are matched, the bar shows their units.
         if not state.is_matching:
-            total = int(state.used[: state.rows].any(1).sum())
-            done = total - int(state.lacks_estimate.sum())
-            self._progress.count("estimate", done, total, "pair")
+            done = int(state.estimated.sum())
+            self._progress.count("estimate", done, state.rows, "pair")
 
     def _save_scene(self, job: SceneJob, answer: Solution, seconds: float) -> None:
         contents = [pair.contents for pair in job.pairs]
@@ -426,51 +418,29 @@ class Run:
 
     def fault(self, text: str, level: int = logging.DEBUG) -> None:
         """Record a fault, if any, once for each text: a broken disk would fill the log with them."""
-        if text and text not in self.faults and len(self.faults) < MAX_FAULTS:
-            self.faults.append(text)
+        faults = self.about.faults
+        if text and text not in faults and len(faults) < MAX_FAULTS:
+            faults.append(text)
             logger.log(level, text)
 
     def _say(self, text: str) -> None:
         self._progress.note(text)
         logger.debug(text)
 
-    def _show(self, plan: Plan) -> None:
+    def _show(self, phase: int) -> None:
         """Show the phase and the units that are done; a change of phase is a line of the log."""
         done = self.state.done[: self.state.rows]
-        text = PHASES[plan.phase]
-        self._progress.count(text, int(done.sum()), done.size, "unit")
-        # In other phases, the number of units that fit changes with each pair.
-        if plan.phase == DEEPEN:
-            text = (
-                f"{text}: {plan.fit} of {plural(len(self.state.units), 'unit')} fit for all pairs"
-            )
-        if text != self._explained:
-            self._explained = text
-            logger.debug(text)
+        self._progress.count(PHASES[phase], int(done.sum()), done.size, "unit")
+        if phase != self._phase:
+            self._phase = phase
+            logger.debug(PHASES[phase])
 
     # The end
 
-    def _publish(self) -> None:
-        self.publication.publish(self.about, is_last=self._has_ended)
-        self.fault(self.publication.unwritten)
-        self.fault(self.store.trouble)
-
-    @property
-    def about(self) -> About:
-        """Facts about the run so far."""
-        state = self.state
-        return replace(
-            state.request.about,
-            ending=self.ending if self._has_ended else Ending.NOT_ENDED,
-            seconds=self.budget.spent(),
-            resumed=self.resumed,
-            units_run=self.units_run,
-            estimated=self.estimated,
-            faults=self.faults,
-            failures=list(state.scene_failures.values()),
-            unwritten=self.publication.unwritten,
-            unsaved=self.store.trouble,
-        )
+    def _publish(self, *, is_last: bool = False) -> None:
+        self.publication.publish(is_last=is_last)
+        self.fault(self.about.unwritten)
+        self.fault(self.about.unsaved)
 
     @property
     def ending(self) -> Ending:
@@ -483,13 +453,6 @@ class Run:
             return Ending.WITH_FAILURES if state.has_failures else Ending.COMPLETE
         has_estimators = bool(self.site.of(Kind.ESTIMATE))
         return Ending.TIME_IS_UP if has_estimators and not self.site.is_closed else Ending.NO_WORKER
-
-    def report(self) -> Results:
-        """End the run. Return its results."""
-        self.end()
-        self.fault(self.store.flush())  # the disk may have room again
-        # Facts that a full disk kept from the store
-        return replace(results_of(self.store), about=self.about)
 
 
 def _keys(pairs: Sequence[PairInputs]) -> list[str]:

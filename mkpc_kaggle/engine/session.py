@@ -218,8 +218,7 @@ def run_pairs(
         site = _site(pairs, assembly, session)
         run = Run(state, site, store, budget, session.interrupt, progress)
         session.save = run.publication.save
-        with logged(work_dir / LOG_NAME), run:
-            run.run()
+        with logged(work_dir / LOG_NAME):
             return run.report()
 
 

@@ -101,13 +101,12 @@ class State:
                 self.note_unreadable(index, reasons[0])
 
     def _start_pairs(self, count: int, units: int) -> None:
-        size = (count, units)
         # Column by column: the plan looks at one unit of all pairs at a time.
-        self.points = np.zeros(size, "S32", order="F")
-        self.done = np.zeros(size, bool, order="F")
-        self.needed = np.ones(size, bool, order="F")
-        self.matches = np.zeros(size, np.int32, order="F")
-        self.losses = np.zeros((count, units + 1), np.int8, order="F")
+        self.points = np.zeros((units, count), "S32").T
+        self.done = np.zeros((units, count), bool).T
+        self.needed = ~self.done
+        self.matches = np.zeros((units, count), np.int32).T
+        self.losses = np.zeros((units + 1, count), np.int8).T
         self.estimate = np.zeros(count, "S32")
         self.estimated = np.zeros(count, bool)
         self.F = np.tile(FALLBACK_FUNDAMENTAL, (count, 1, 1))
@@ -126,10 +125,7 @@ class State:
         scene = self.request.recipe.scene
         batches = batches_of(self.pairs) if scene is not None else {}
         self.batches = {name: number for number, name in enumerate(batches)}
-        self.members = [np.asarray(members, int) for members in batches.values()]
-        self.batch_of = np.full(len(self.pairs), -1)
-        for number, members in enumerate(self.members):
-            self.batch_of[members] = number
+        self.batch_of = np.array([self.batches.get(pair.group, -1) for pair in self.pairs], int)
         self.candidates = candidates_of(self.units, scene)
         size = (len(batches), len(self.candidates))
         self.made = np.full(size, None, object)  # of SceneRecord
@@ -151,10 +147,14 @@ class State:
         return np.asarray(self.done & self.needed)
 
     @property
+    def is_row(self) -> Mask:
+        return np.asarray(np.arange(len(self.pairs)) < self.rows)
+
+    @property
     def lacks_estimate(self) -> Mask:
         """(N,): the row's estimate is not from the points in use, and this run can get it."""
-        is_row = np.arange(len(self.pairs)) < self.rows  # extra pairs are for scenes alone
-        is_open = is_row & ~self.estimated & (self.losses[:, ESTIMATE] < GIVEN_UP)
+        # Extra pairs are for scenes alone.
+        is_open = self.is_row & ~self.estimated & (self.losses[:, ESTIMATE] < GIVEN_UP)
         return np.asarray(is_open & self.used.any(1))
 
     @property
@@ -171,11 +171,6 @@ class State:
         """The number of the first unit that can run, of stage 1 if possible."""
         usable = np.flatnonzero(~self.dead).tolist()
         return min(usable, key=lambda unit: (self.is_crop[unit], unit), default=0)
-
-    @property
-    def complete(self) -> Mask:
-        """(rows,): all units and the estimate are today's."""
-        return np.asarray((self.done.all(1) & self.estimated)[: self.rows])
 
     def by_batch(self, values: NDArray[Any]) -> NDArray[np.int_]:
         """Return the sum of each batch (B,) over its pairs' values (N,)."""
@@ -237,12 +232,12 @@ class State:
         best: SceneRecord = made[best_of({name: made[name].disagreement for name in made})]
         return best
 
-    def missing_scene(self, batch: str) -> str:
-        """Return the reason why a batch has no scene."""
-        number = self.batches[batch]
-        members = self.members[number]
-        may_match = (self.missing | (self.matches > 0))[members[members < self.rows]].any()
-        return self.scene_failures.get(number, NOT_RECONSTRUCTED if may_match else NO_CAMERAS)
+    @property
+    def scene_reasons(self) -> list[str]:
+        """Why each batch (B,) has no scene, if it has none."""
+        may_match = self.is_row & (self.missing | (self.matches > 0)).any(1)
+        reasons = np.where(self.by_batch(may_match), NOT_RECONSTRUCTED, NO_CAMERAS)
+        return [self.scene_failures.get(batch, why) for batch, why in enumerate(reasons.tolist())]
 
     @property
     def has_failures(self) -> bool:
@@ -298,10 +293,9 @@ class State:
 
     def scene_inputs(self, batch: int) -> tuple[tuple[PairInputs, ...], str]:
         """Return the pairs of a batch that have points, and the key of a scene from them."""
-        members = self.members[batch]
         # A pair without points adds nothing to a scene.
-        used = members[(self.done[members] & self.needed[members]).any(1)].tolist()
-        pairs = tuple(map(self.inputs_of, used))
+        used = (self.batch_of == batch) & self.used.any(1)
+        pairs = tuple(map(self.inputs_of, np.flatnonzero(used).tolist()))
         facts = [
             [*self.names[pair.index], pair.contents, [*pair.points.values()], pair.estimate]
             for pair in pairs
@@ -391,7 +385,7 @@ class State:
             return
         made[number] = record
         scene = self.scene(batch)
-        members = self.members[batch]
+        members = np.flatnonzero(self.batch_of == batch)
         self.dirty[members] = True
         self.scene_source[members] = FALLBACK  # of the former scene
         for index in members.tolist():

@@ -545,9 +545,7 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
 
     whole_wait = site.wait
     site.wait = wait
-    with run:
-        run.run()
-        report = run.report()
+    report = run.report()
     # A bad pair can have no F, except on the place that takes over.
     bad = list(scenario.fates)
     swept = state.used[: scenario.pairs].any(1)

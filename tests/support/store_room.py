@@ -155,7 +155,7 @@ class Room:
         self.run.save(job, answer, 1.5)
 
     def publish(self) -> None:
-        self.run.publication.publish(self.run.about)
+        self.run.publication.publish()
 
     @property
     def standing(self) -> tuple[int, int, bool]:
