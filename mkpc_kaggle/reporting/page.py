@@ -35,7 +35,7 @@ DRAWING_S = 5.0  # pictures are drawn only if more time is left
 MAX_PICTURES = 12
 MAX_VIEWS = 12  # scenes in 3D: each adds its points to the page
 MAX_ROWS = 1000  # of a table; browsers are slow with more
-SHOWN_OF_PAIRS = ["pair", "group", "matches", "inliers", "support", "source", "choice", "failure"]
+SHOWN_OF_PAIRS = ["pair", "group", "matches", "inliers", "source", "choice", "failure"]
 SHOWN_OF_CAMERAS = ["batch", "model", "image", "points", "focal", "camera_model"]
 STYLE = """
 body { margin: 1rem auto; max-width: 76rem; padding: 0 1rem; font: 1rem/1.5 system-ui, sans-serif;
