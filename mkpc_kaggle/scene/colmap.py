@@ -18,15 +18,17 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mkpc_kaggle.cores import available_cores
+from mkpc_kaggle.data.outputs import sync
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX
 from mkpc_kaggle.geometry.focal_prior import FOCAL_RATIO
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.adjustment import adjust, drop_flat_lenses
-from mkpc_kaggle.scene.export import DATABASE, MODELS, sync
 from mkpc_kaggle.scene.keypoints import Lens, MergedGraph
 from mkpc_kaggle.scene.models import (
+    DATABASE,
     MIN_IMAGES,
+    MODELS,
     Reconstruction,
     RegisteredImage,
     SfmModel,
