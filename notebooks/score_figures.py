@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from mkpc_kaggle.evaluation.validate import gain_of
 from mkpc_kaggle.geometry.metrics import ROTATION_THRESHOLDS, TRANSLATION_THRESHOLDS
 from mkpc_kaggle.pipeline.drawing import new_figure
-from mkpc_kaggle.reporting.figures import plain_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -139,3 +138,11 @@ def _legend_below(figure: "Figure") -> None:
 def short(name: str, most: int = 18) -> str:
     """Return a name of up to ``most`` letters."""
     return name if len(name) <= most else name[: most - 1] + "…"
+
+
+def plain_axes(axes: "Axes", title: str) -> "Axes":
+    """Return the axes with a title on the left and without the top and right edges of the frame."""
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.tick_params(labelsize=9)
+    axes.spines[["top", "right"]].set_visible(False)
+    return axes

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from score_figures import COLOURS, DROPPED, short
+from score_figures import COLOURS, DROPPED, plain_axes, short
 
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import Image
@@ -20,7 +20,6 @@ from mkpc_kaggle.geometry.robust import Estimate
 from mkpc_kaggle.pipeline.drawing import INLIER, OUTLIER, REGION, new_figure, sample
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.reporting.figures import plain_axes
 from mkpc_kaggle.scene.models import Reconstruction, SfmModel, models_of
 
 if TYPE_CHECKING:

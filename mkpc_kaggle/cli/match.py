@@ -6,7 +6,6 @@ from pathlib import Path
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.errors import plural
-from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.arguments import as_image
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
@@ -51,11 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         save(match.plot(*images), arguments.out)
         print(f"figure: {arguments.out}")
-    return int(_nothing_ran(match))
-
-
-def _nothing_ran(match: PairMatch) -> bool:
-    return len(match.failures) == len(match.results)
+    return int(len(match.failures) == len(match.results))
 
 
 def _lines(match: PairMatch, recipe: str) -> list[str]:
@@ -66,11 +61,6 @@ def _lines(match: PairMatch, recipe: str) -> list[str]:
     lines += [f"this is the fallback: {found.failure}"] if found.failure else []
     inliers = plural(found.inlier_count, "inlier")
     lines.append(f"{plural(len(match.matches), 'match')}, {inliers}")
-    if not _nothing_ran(match):  # failed units say nothing of the images
-        lines.append(
-            f"{found.stats.support:.1f} times the inliers expected by chance; "
-            f"images overlap from {MIN_SUPPORT:g} on"
-        )
     for result in match.results:
         counts = f"{plural(len(result.matches), 'match'):>14}  {result.seconds:.2f} s"
         remark = result.failure or result.note or (str(result.need) if result.need else "")

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.images import READ_SUFFIXES
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import CameraSharing
+from mkpc_kaggle.reconstruction.folder import require_folder
 from mkpc_kaggle.reconstruction.outputs import WORK
 from mkpc_kaggle.reconstruction.run import reconstruct
 from mkpc_kaggle.signals import interruptible
@@ -41,7 +41,8 @@ signal.
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("images", type=Path, nargs="+", metavar="DIR", help="the folder of photographs")
+    # Checked here: of `*.jpg`, the first path is refused before argparse lists the others.
+    add("images", type=require_folder, metavar="DIR", help="the folder of photographs")
     add("--out", type=Path, required=True, metavar="OUT", help="folder for the results")
     options.add_matching(parser)
     options.add_run(parser, time_limit=None)
@@ -60,14 +61,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    if len(arguments.images) > 1:
-        raise UserError(f"{arguments.images[1]}: several paths; give the folder of the photographs")
     with (
         interruptible() as interrupt,
         options.watched_session(arguments, arguments.out / WORK, interrupt) as session,
     ):
         reconstruct(
-            arguments.images[0],
+            arguments.images,
             arguments.out,
             arguments.recipe,
             weights=arguments.weights,

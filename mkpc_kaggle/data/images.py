@@ -69,8 +69,6 @@ class Image:
     version: str = ""  # :func:`content_digest` of its file
     focal: float = 0.0  # in pixels, from EXIF; 0: unknown
     turns: int = 0  # counter-clockwise quarter turns, from EXIF
-    # Size in bytes and time of change in nanoseconds of its file before it was read; 0: not noted
-    file: tuple[int, int] = (0, 0)
 
     @classmethod
     def of_array(cls, array: Pixels) -> "Image":
@@ -139,8 +137,6 @@ def read_image(path: Path) -> Image | Unreadable:
     Of 16 bits, the upper eight count. A file that is cut off is unreadable.
     """
     name = str(path)
-    # Before it is read, so that a later change is never missed.
-    state = file_state(path)
     try:
         with open_regular(path) as stream:
             data = stream.read()
@@ -162,7 +158,7 @@ def read_image(path: Path) -> Image | Unreadable:
     except Exception as error:  # a reader may raise anything for a damaged file
         return Unreadable(name, f"cannot be read: {getattr(error, 'strerror', None) or error}")
     turns, focal = exif_facts(tags, size)
-    return Image(name, pixels, BLAKE2(data).hexdigest(), focal, turns, state)
+    return Image(name, pixels, BLAKE2(data).hexdigest(), focal, turns)
 
 
 @contextmanager
@@ -313,11 +309,9 @@ class ByteCache:
 
 
 class ImageStore:
-    """Images by path, decoded in the background; the most recently used are cached as long as their
-    files do not change.
+    """Images by path, decoded in the background; the most recently used are cached.
 
-    Otherwise two workers might answer with the former and the new content of a file in turns, and each
-    answer would drop the results of the other. Besides the cache, only the images of the latest
+    Files are not expected to change. Besides the cache, only the images of the latest
     :meth:`prefetch` wait, and the one that is being decoded. Not thread-safe.
     """
 
@@ -346,7 +340,7 @@ class ImageStore:
 
     def get(self, path: Path) -> Image | Unreadable:
         """Wait until the image is decoded, then return it."""
-        image: Image | Unreadable | None = self._cached(path)
+        image: Image | Unreadable | None = self._images.get(path)
         if image is None:
             self._start(path)
             image = self._pending.pop(path).result()
@@ -354,25 +348,12 @@ class ImageStore:
         return image
 
     def _start(self, path: Path) -> None:
-        if path not in self._pending and self._cached(path) is None:
+        if path not in self._pending and self._images.get(path) is None:
             self._pending[path] = self._decoder.submit(read_image, path)
-
-    def _cached(self, path: Path) -> Image | None:
-        image: Image | None = self._images.get(path)
-        # A file that is missing now keeps its image.
-        if image is not None and file_state(path) in (image.file, (0, 0)):
-            return image
-        return None
 
     def _keep(self, path: Path, image: Image | Unreadable) -> None:
         if isinstance(image, Image):
             self._images.put(path, image, image.nbytes)
-
-    @property
-    def nbytes(self) -> int:
-        """The memory of the images that are cached, or decoded and waiting, in bytes."""
-        waiting = [future.result() for future in self._pending.values() if future.done()]
-        return self._images.bytes + sum(each.nbytes for each in waiting if isinstance(each, Image))
 
     def close(self) -> None:
         """Stop decoding: images that wait are dropped, and the one in work is not waited for."""

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TextIO
 
 from mkpc_kaggle.errors import UserError
@@ -13,6 +14,7 @@ from mkpc_kaggle.errors import UserError
 # Suffix of each option's results. In an input directory, a file with it is an earlier result.
 SUFFIXES = {"--output": ".csv", "--json": ".json", "the report": ".html"}
 UNFINISHED: set[Path] = set()  # temporary files of this process
+PROBE_BYTES = 1 << 20  # more than the buffer of a stream that pycolmap writes
 
 
 def require_apart(
@@ -74,14 +76,9 @@ def same_file(path: Path, other: Path) -> bool:
 def replacing(path: Path) -> Iterator[TextIO]:
     """Open a temporary file, which replaces ``path`` once the new file is complete and on disk.
 
-    The temporary file lies next to ``path``; files that a killed process left there are removed. A
-    device such as ``/dev/stdout`` is written directly. Raises ``OSError`` and removes the temporary
-    file if writing fails.
+    The temporary file lies next to ``path``; files that a killed process left there are removed.
+    Raises ``OSError`` and removes the temporary file if writing fails.
     """
-    if path.is_char_device():
-        with path.open("w", encoding="utf-8", newline="") as stream:
-            yield stream
-        return
     for left in path.parent.glob(f".{escape(path.name)}.*.part"):
         with suppress(OSError):
             left.unlink()
@@ -97,6 +94,22 @@ def replacing(path: Path) -> Iterator[TextIO]:
     finally:
         part.unlink(missing_ok=True)
         UNFINISHED.discard(part)
+
+
+def sync(folder: Path) -> None:
+    """Wait until the files below a folder are on the disk. Raise ``OSError`` if the disk is full.
+
+    A power failure must not leave empty files under their names.
+    """
+    for path in folder.rglob("*"):
+        if path.is_file() and not path.is_symlink():
+            with path.open("rb") as stream:
+                os.fsync(stream.fileno())
+    # pycolmap reports no full disk, so a file of ours must fit after its files.
+    with TemporaryFile(dir=folder) as probe:
+        probe.write(bytes(PROBE_BYTES))
+        probe.flush()
+        os.fsync(probe.fileno())
 
 
 def remove_unfinished() -> None:

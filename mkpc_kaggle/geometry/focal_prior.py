@@ -34,7 +34,6 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import (
     DistinctMatches,
     Estimate,
-    EstimateStats,
     ModelKind,
     RobustConfig,
     consensus,
@@ -157,9 +156,7 @@ def estimate_with_prior(
         inliers = np.abs(sampson(best.fundamental, *search.rays)) < magsac.threshold
         matrix = best.fundamental if model is ModelKind.E else search.for_pixels(best.fundamental)
     own = unit_norm(search.for_pixels(plain.fundamental)) if plain else None
-    stats = EstimateStats(best.cost, search.focals(best))
-    all_inliers = distinct.mask_of_all(inliers)
-    return Estimate(model, unit_norm(matrix), all_inliers, magsac=own, stats=stats)
+    return Estimate(model, unit_norm(matrix), distinct.mask_of_all(inliers), magsac=own)
 
 
 class _Candidate(NamedTuple):
@@ -170,7 +167,6 @@ class _Candidate(NamedTuple):
 
     fundamental: Matrix3
     cost: float
-    logs: Vectors | None = None  # log f / g of both cameras; None for MAGSAC's own F
 
 
 def _finite(candidates: Sequence[_Candidate]) -> list[_Candidate]:
@@ -255,15 +251,8 @@ class _Search:
         for start in rough[:FINE_STARTS]:
             view = self._searched(self._many, start, FINE_SCALES)
             cost = self._cost(view.fundamental, view) + self._all.prior_cost(view)
-            found.append(_Candidate(view.fundamental, cost, view.logs))
+            found.append(_Candidate(view.fundamental, cost))
         return found
-
-    def focals(self, found: _Candidate) -> tuple[float, float]:
-        """Return both focal lengths in pixels; 0 for MAGSAC's own F."""
-        if found.logs is None:
-            return 0.0, 0.0
-        ratio0, ratio1 = np.exp(found.logs).tolist()
-        return self._priors[0].focal * ratio0, self._priors[1].focal * ratio1
 
     def for_pixels(self, F: Matrix3) -> Matrix3:
         """Convert an F for rays to an F for homogeneous pixels."""

@@ -6,8 +6,7 @@ is refined by that table's ``scale``, and this threshold counts the inliers.
 
 Other limits, in pixels of the stored image, are for other purposes: 0.4 for rough starts under a prior
 (``ESSENTIAL_THRESHOLD_PX``), 2.0 for pycolmap's verification (``MAX_ERROR_PX``), 2.0 for matches that speak
-against a scene's F (:mod:`mkpc_kaggle.scene.choose`), 1.0 for the support of an F. ``threshold`` in a matcher's
-table is a confidence.
+against a scene's F (:mod:`mkpc_kaggle.scene.choose`). ``threshold`` in a matcher's table is a confidence.
 
 An estimate always has a matrix. If no model is found, it holds the reason and the fallback matrix,
 which is finite and of the right rank. So a submission is always complete.
@@ -60,13 +59,9 @@ class RobustConfig:
 
 @dataclass(frozen=True)
 class EstimateStats:
-    """Statistics of an estimate, for the diagnosis of bad pairs."""
+    """Statistics that the engine still stores: always 0, until it no longer reads them."""
 
-    # Under a prior on focal lengths: the sum of the robust costs of the distinct matches, at most 0.5
-    # each, and of the prior, or the penalty for an F without focal lengths
-    cost: float = 0.0
-    focals: tuple[float, float] = (0.0, 0.0)  # in pixels, of both images; 0 if unknown
-    support: float = 0.0  # see :mod:`mkpc_kaggle.geometry.overlap`
+    support: float = 0.0
 
 
 NO_STATS = EstimateStats()

@@ -12,12 +12,7 @@ from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.crop_need import CropNeed
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.overlap import support
-from mkpc_kaggle.geometry.robust import (
-    Estimate,
-    ModelKind,
-    estimate,
-)
+from mkpc_kaggle.geometry.robust import Estimate, ModelKind, estimate
 from mkpc_kaggle.pipeline.arguments import ImageSource, as_image
 from mkpc_kaggle.recipe import Recipe, Unit
 
@@ -150,9 +145,4 @@ def with_estimate(
             priors = [FocalPrior.of_image(size, focal) for size, focal in both]
         first, second = priors
         found = estimate_with_prior(matches, (first, second), recipe.magsac, recipe.focal, model)
-    if found.ok and model is not ModelKind.H:
-        K0, K1 = (intrinsics if model is ModelKind.E else None) or (np.eye(3), np.eye(3))
-        # The overlap test compares points in pixels, so an E becomes an F.
-        F = np.linalg.inv(K1).T @ found.matrix @ np.linalg.inv(K0)
-        found = replace(found, stats=replace(found.stats, support=support(F, matches)))
     return replace(pair, results=results, estimate=found)

@@ -22,14 +22,20 @@ FOCALS = (0.1, 10.0)  # in long sides of the image, as in COLMAP's ``has_bogus_p
 Ends = tuple[Path, Path]  # the two images of a pair
 
 
+def require_folder(path: str | Path) -> Path:
+    """Return the path of a folder. Raise :class:`UserError` for any other path."""
+    if not Path(path).is_dir():
+        raise UserError(f"{path} is no folder; give the folder that has the photographs")
+    return Path(path)
+
+
 def read_folder(root: Path) -> list[Path]:
     """Return the photographs below ``root``, sorted: the files with a suffix of photographs.
 
     Hidden files and folders are skipped. A line counts the other files. Raises :class:`UserError` if
     fewer than three photographs are found, and for a name that is no text.
     """
-    if not root.is_dir():
-        raise UserError(f"{root} is no folder; give the folder that has the photographs")
+    require_folder(root)
     files: list[Path] = []
     others: Counter[str] = Counter()
     for place, folders, names in os.walk(root, onerror=_refuse):

@@ -11,14 +11,13 @@ from typing import Any, Self
 
 import numpy as np
 
-from mkpc_kaggle.data.outputs import lies_in
+from mkpc_kaggle.data.outputs import lies_in, sync
 from mkpc_kaggle.engine.store import FILE_NAME
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.reconstruction.folder import CAMERA_COLUMNS
 from mkpc_kaggle.reconstruction.process import Child
-from mkpc_kaggle.scene.export import DATABASE, IMAGES, MODELS, PART, SPARSE, sync
-from mkpc_kaggle.scene.models import SfmModel
+from mkpc_kaggle.scene.models import DATABASE, MODELS, SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 WORK = "work"
@@ -26,6 +25,8 @@ WORK = "work"
 SCENES, FORMER = "scenes", "former"
 TABLE = "cameras.csv"
 PAGE = "report.html"
+IMAGES, SPARSE = "images", "sparse"  # as other programs expect them
+PART = ".mkpc-new-"  # prefix of temporary folders for new files
 FOLDERS = (MODELS, IMAGES, SPARSE)
 RESULTS = (DATABASE, TABLE, *FOLDERS)
 MIN_COMMON = 3  # cameras

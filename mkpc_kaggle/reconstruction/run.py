@@ -46,12 +46,6 @@ MAGSAC_ITERATIONS = 2_000
 ALL_TRACKS = 50
 
 
-class Models(tuple[SfmModel, ...]):
-    """The models of :func:`reconstruct`, the largest first, and the problems of its run."""
-
-    problems: tuple[str, ...] = ()
-
-
 def reconstruct(
     images: PathSource,
     out: PathSource | None = None,
@@ -68,7 +62,7 @@ def reconstruct(
     masks: PathSource | None = None,
     progress: bool = True,
     session: Session | None = None,
-) -> Models:
+) -> tuple[SfmModel, ...]:
     """Return the models of a folder of photographs: cameras and points by structure from motion.
 
     Parameters
@@ -94,8 +88,8 @@ def reconstruct(
 
     Returns
     -------
-    Models
-        A tuple of models, the largest first; empty if too few images match. Cameras refer to the
+    tuple of SfmModel
+        The models, the largest first; empty if too few images match. Cameras refer to the
         stored pixels of the files, as COLMAP reads them.
 
     Raises
@@ -146,10 +140,10 @@ def reconstruct(
                 listed = choose_pairs(files, out / WORK, session.budget.stop_units)
         recipe = for_cameras(assembly.recipe, camera)
         assembly = replace(assembly, recipe=recipe, masks=shown, cameras=cameras)
-        models = _run(root, files, listed, out, assembly, session)
-        for problem in models.problems:
+        models, problems = _run(root, files, listed, out, assembly, session)
+        for problem in problems:
             logger.warning(problem)
-        session.status = int(not models or bool(models.problems))
+        session.status = int(not models or bool(problems))
         if session.interrupt.is_set():
             raise KeyboardInterrupt(session.interrupt.signal or signal.SIGINT)
         return models
@@ -190,8 +184,10 @@ def _run(
     out: Path,
     assembly: Assembly,
     session: Session,
-) -> Models:
-    """Match the pairs, and write the results and the report to ``out``."""
+) -> tuple[tuple[SfmModel, ...], list[str]]:
+    """Match the pairs, and write the results and the report to ``out``. Return the models, the
+    largest first, and the problems of the run.
+    """
     from mkpc_kaggle.reporting.page import report_run
     from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
@@ -235,6 +231,4 @@ def _run(
     say(summary(report))
     session.status = int(not models)
     say(report_run(session.work_dir, out / PAGE, session.must_end(), pairs))
-    result = Models(models)
-    result.problems = tuple(filter(None, problems))
-    return result
+    return tuple(models), list(filter(None, problems))

@@ -9,7 +9,6 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.drawing import DPI, new_figure
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -40,11 +39,3 @@ def encode(figure: "Figure", kind: str, dpi: int = DPI) -> bytes:
     options = {"quality": 82} if kind == "jpeg" else None
     figure.savefig(stream, format=kind, dpi=dpi, pil_kwargs=options)
     return stream.getvalue()
-
-
-def plain_axes(axes: "Axes", title: str) -> "Axes":
-    """Return the axes with a title on the left and without the top and right edges of the frame."""
-    axes.set_title(title, loc="left", fontsize=10)
-    axes.tick_params(labelsize=9)
-    axes.spines[["top", "right"]].set_visible(False)
-    return axes

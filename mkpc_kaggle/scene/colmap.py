@@ -18,15 +18,17 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mkpc_kaggle.cores import available_cores
+from mkpc_kaggle.data.outputs import sync
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX
 from mkpc_kaggle.geometry.focal_prior import FOCAL_RATIO
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.adjustment import adjust, drop_flat_lenses
-from mkpc_kaggle.scene.export import DATABASE, MODELS, sync
 from mkpc_kaggle.scene.keypoints import Lens, MergedGraph
 from mkpc_kaggle.scene.models import (
+    DATABASE,
     MIN_IMAGES,
+    MODELS,
     Reconstruction,
     RegisteredImage,
     SfmModel,
@@ -55,7 +57,6 @@ SEED = 0
 # focal lengths of a half to twice the true ones keep 0.998 of the matches of castle_p19 and 0.999 of
 # herz_jesus_p8. Beyond, nothing was measured.
 MAX_FOCAL_CHANGE = 2.0
-DEFAULTS = SceneConfig()
 # Configurations of a two-view geometry whose H was estimated
 WITH_HOMOGRAPHY = (
     pycolmap.TwoViewGeometryConfiguration.PLANAR,
@@ -95,7 +96,7 @@ def write_files(
     merged: MergedGraph,
     shared: SharedIntrinsics,
     models: Sequence[SfmModel],
-    config: SceneConfig = DEFAULTS,
+    config: SceneConfig,
 ) -> None:
     """Write COLMAP's files: the database and one folder per model, in place of ``directory``.
 

@@ -42,8 +42,8 @@ def local_features(path: Path) -> Descriptors:
     return np.asarray((SCALE * root_sift(found)).round(), np.uint8)
 
 
-def shortlist(features: Sequence[Descriptors], count: int = PARTNERS) -> list[tuple[int, int]]:
-    """Return the sorted, distinct pairs of each image and its ``count`` most similar images, by their
+def shortlist(features: Sequence[Descriptors]) -> list[tuple[int, int]]:
+    """Return the sorted, distinct pairs of each image and its ``PARTNERS`` most similar images, by their
     :func:`local_features`, each with the smaller index first.
 
     An image without features is similar to no other image.
@@ -58,7 +58,7 @@ def shortlist(features: Sequence[Descriptors], count: int = PARTNERS) -> list[tu
         similarity[own, start + own] = -np.inf
         order = np.argsort(-similarity, axis=1, kind="stable")
         # The last one is the image itself.
-        for image, others in enumerate(order[:, :-1][:, :count].tolist(), start):
+        for image, others in enumerate(order[:, :-1][:, :PARTNERS].tolist(), start):
             pairs.update((min(image, other), max(image, other)) for other in others)
     return sorted(pairs)
 

@@ -12,6 +12,7 @@ from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.scene.view_graph import BatchImage
 
+DATABASE, MODELS = "database.db", "models"  # COLMAP's files of a batch
 MIN_IMAGES = 3  # in a model
 MIN_POINTS = 30  # seen by a plausible image
 PLAUSIBLE_FOCALS = Range(0.3, 5.0)  # plausible focal lengths, in long sides of the image

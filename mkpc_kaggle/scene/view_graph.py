@@ -1,7 +1,7 @@
 """The view graph of a batch: its distinct images, and the matches between them."""
 
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
@@ -71,13 +71,12 @@ class Edge:
 @dataclass(frozen=True, eq=False)
 class ViewGraph:
     """Distinct images, and their edges, sorted by image indices. ``known`` has the user's cameras,
-    by digest. ``copies`` has the other names of an image's content, by digest.
+    by digest.
     """
 
     images: tuple[BatchImage, ...]
     edges: tuple[Edge, ...]
     known: Mapping[str, KnownCamera] = field(default_factory=dict)
-    copies: Mapping[str, Collection[str]] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -108,11 +107,8 @@ class ViewGraph:
         """
         # The first image with a content stands for all of them.
         images: dict[str, BatchImage] = {}
-        copies: dict[str, set[str]] = {}
         for image in (image for pair in pairs for image in (pair.image0, pair.image1)):
-            kept = images.setdefault(image.digest, image)
-            if image.name != kept.name:
-                copies.setdefault(image.digest, set()).add(image.name)
+            images.setdefault(image.digest, image)
         index = {digest: number for number, digest in enumerate(images)}
         parts: dict[tuple[int, int], list[Matches]] = {}
         for pair in pairs:
@@ -127,18 +123,13 @@ class ViewGraph:
             if first < second and len(tracks):
                 parts.setdefault((first, second), []).append(tracks)
         edges = tuple(Edge(*ends, Matches.concatenate(parts[ends])) for ends in sorted(parts))
-        return cls(tuple(images.values()), edges, copies=copies)
+        return cls(tuple(images.values()), edges)
 
     def with_intrinsics(self, rows: Rows) -> "ViewGraph":
         """Return the graph with the user's cameras of the images that the rows name."""
         cameras = dict(rows)
-        known: dict[str, KnownCamera] = {}
-        for image in self.images:
-            # By contents: a copy under another name is the same photograph.
-            for name in (image.name, *sorted(self.copies.get(image.digest, ()))):
-                if name in cameras:
-                    known.setdefault(image.digest, cameras[name])
-        return replace(self, known=known)
+        named = [image for image in self.images if image.name in cameras]
+        return replace(self, known={image.digest: cameras[image.name] for image in named})
 
     def components(self) -> tuple["ViewGraph", ...]:
         """Return the components connected by strong edges, ordered by first image."""

@@ -33,16 +33,18 @@ def test_a_shortlist_has_images_that_are_alike_and_none_that_cannot_be_read(
     photographs, tmp_path, monkeypatch
 ):
     features = [*map(local_features, photographs)]
-    found = shortlist(features, 3)
+    monkeypatch.setattr(likeness, "PARTNERS", 3)
+    found = shortlist(features)
     # Large folders are compared in parts.
     monkeypatch.setattr(likeness, "COMPARED_AT_A_TIME", 2)
-    assert shortlist(features, 3) == found
+    assert shortlist(features) == found
     assert found == sorted(set(found))
     assert all((i < 6) == (j < 6) and i < j for i, j in found)
     assert {index for pair in found for index in pair} == set(range(12))
     # Without features, images are in the order of their names.
     nothing = [local_features(tmp_path / f"none{number}.png") for number in range(3)]
-    assert shortlist(nothing, 1) == [(0, 1), (0, 2)]
+    monkeypatch.setattr(likeness, "PARTNERS", 1)
+    assert shortlist(nothing) == [(0, 1), (0, 2)]
 
 
 def test_the_pairs_of_a_large_folder_are_chosen_once(photographs, tmp_path, monkeypatch):

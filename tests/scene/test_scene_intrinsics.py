@@ -49,14 +49,13 @@ def focal_ratios(model: SfmModel) -> dict[str, float]:
     return ratios
 
 
-def test_a_camera_is_that_of_all_copies_of_its_photograph():
-    """A copy whose name comes first stands for the photograph that the row names."""
-    camera = KnownCamera("SIMPLE_PINHOLE", (900.0, 400, 300))
+def test_photographs_of_one_content_are_one_image():
     pair = SCENE.pairs[0]
     copied = replace(pair.image0, name="a copy.jpg")
     pairs = [replace(pair, image0=copied), replace(pair, image0=pair.image1, image1=pair.image0)]
-    rows = [(pair.image0.name, camera)]
-    assert ViewGraph.of_pairs(pairs).with_intrinsics(rows).known == {copied.digest: camera}
+    graph = ViewGraph.of_pairs(pairs)
+    assert graph.names == ("a copy.jpg", pair.image1.name)
+    assert len(graph.edges) == 1
 
 
 @pytest.mark.parametrize("sharing", [CameraSharing.AUTO, CameraSharing.FOLDER])
