@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from math import inf
@@ -10,7 +11,6 @@ from typing import Any
 
 from mkpc_kaggle.data.competition import Pair, TrainScene, read_train_side
 from mkpc_kaggle.engine.budget import Budget, monotonic_of
-from mkpc_kaggle.engine.cluster import parse_workers
 from mkpc_kaggle.engine.session import Session
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.progress import parse_duration
@@ -21,6 +21,8 @@ from mkpc_kaggle.signals import Interrupt
 
 RECIPE = """a recipe, or one matcher such as aliked_lightglue (default: auto, every matcher with its weights).
     MODE stage-1 runs its units of stage 1 alone, whole-images all its units without crops"""
+
+WORKER_FORMS = "a number of processes, ray (this machine's cluster, or a new one for this run), ray://HOST:PORT"
 
 
 def add_matching(parser: argparse.ArgumentParser) -> None:
@@ -122,6 +124,16 @@ def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
         ray: use the Ray cluster of this machine, one worker per GPU, or per machine without GPUs; HOST:PORT as
         printed by `ray start --head`"""
     add("--workers", type=parse_workers, metavar="N|ray[://HOST:PORT]", help=text)
+
+
+def parse_workers(text: str) -> int | str:
+    """Parse the value of ``--workers``: return a number, or a cluster's name unchanged.
+
+    Raises :class:`UserError` with the accepted forms if the text has none of them.
+    """
+    if not re.fullmatch(r"\d{1,3}|ray(://[^/\s]+:\d{1,5})?", text):
+        raise UserError(f"--workers: {text!r} is none of: {WORKER_FORMS}")
+    return int(text) if text.isdecimal() else text
 
 
 def settings_of(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -104,6 +104,15 @@ def name_below(root: str, file: str) -> str:
     return file.removeprefix(root.rstrip("/") + "/") if root else file
 
 
+def visiting_order(pairs: Sequence[Pair]) -> list[int]:
+    """Return pair indices in an order that puts pairs with a common image together, for encoding
+    cache hits.
+    """
+    # The group first: a batch that is finished early gets its scene early.
+    keys = [(pair.group, pair.file0, pair.file1) for pair in pairs]
+    return sorted(range(len(pairs)), key=keys.__getitem__)
+
+
 def test_side(directory: Path) -> tuple[Path, Path]:
     """Return the paths of ``test.csv`` and ``test_images/``."""
     home = directory.parent if directory.name == "test_images" else directory

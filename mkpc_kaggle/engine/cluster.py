@@ -5,7 +5,6 @@ system. If the main machine or Ray's head node fails, rerun the command to resum
 """
 
 import os
-import re
 import signal
 import socket
 import textwrap
@@ -26,18 +25,7 @@ from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.setup.assembly import Assembly
 from mkpc_kaggle.version import __version__
 
-WORKER_FORMS = "a number of processes, ray (this machine's cluster, or a new one for this run), ray://HOST:PORT"
 REACH_TIMEOUT_S = 5.0  # for a head node to accept a connection
-
-
-def parse_workers(text: str) -> int | str:
-    """Parse the value of ``--workers``: return a number, or a cluster's name unchanged.
-
-    Raises :class:`UserError` with the accepted forms if the text has none of them.
-    """
-    if not re.fullmatch(r"\d{1,3}|ray(://[^/\s]+:\d{1,5})?", text):
-        raise UserError(f"--workers: {text!r} is none of: {WORKER_FORMS}")
-    return int(text) if text.isdecimal() else text
 
 
 class RaySite(Site):

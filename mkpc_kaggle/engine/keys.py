@@ -142,20 +142,21 @@ def read_images(
     is_over: Callable[[], bool],
     progress: Progress,
 ) -> tuple[dict[str, BatchImage], dict[str, str]]:
-    """Return digest, size and focal length of each image by name, and why the others cannot be read.
+    """Return digest, size and focal length of each image by name, and why some cannot be read: their digest is
+    empty, and so is that of an image that was not reached in time.
 
     Stored facts of files whose size and time have not changed are used, and new ones are stored. A run reads each
     photograph once before its first job: photographs do not change during a run.
     """
     columns = "name, size, changed, digest, width, height, focal"
     states = {name: file_state(path) for name, path in files.items()}
-    images: dict[str, BatchImage] = {}
+    images = {name: BatchImage(name, "", Size(1, 1)) for name in files}
     unreadable: dict[str, str] = {}
     for name, *state, content, width, height, focal in store.select("image", columns, files):
         # A missing file keeps its results: perhaps nothing must be matched.
         if states[name] in (tuple(state), (0, 0)):
             images[name] = BatchImage(name, content, Size(width, height), focal)
-    new = [name for name in files if name not in images]
+    new = [name for name in files if not images[name].digest]
     # Threads, since both reading and hashing release the interpreter lock.
     pool = ThreadPoolExecutor(HASH_THREADS)
     pending = {pool.submit(lambda name: (name, image_facts(files[name])), name) for name in new}

@@ -58,19 +58,22 @@ class Place:
 
     @property
     def is_idle(self) -> bool:
-        return self.is_loaded and self.job is None
+        return self.worker is not None and self.is_loaded and self.job is None
 
     def may_start(self, now: float) -> bool:
         return self.worker is None and not self.closed and now >= self.restart_at
 
     def start(self, now: float) -> None:
         """Start a worker. Its first answer says whether it is loaded."""
+        self.is_loaded = False
         self.since = now
         self.worker = self.make()
         self.worker.start()
 
     def submit(self, job: Job, now: float) -> None:
-        """Hand a job to the worker, which may still be starting."""
+        """Hand a job to the idle worker, or to one that starts now."""
+        if self.worker is None:
+            self.start(now)
         assert self.worker is not None
         self.job = job
         self.since = now
@@ -106,7 +109,6 @@ class Place:
         if self.worker is not None:
             self.worker.kill()
             self.worker = None
-            self.is_loaded = False
 
 
 class Site:

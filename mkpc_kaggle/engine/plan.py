@@ -140,7 +140,11 @@ class Plan:
         phases[costly] = np.maximum(phases[costly], FILL)
         phases[~missing] = NEVER
         for unit, crop in enumerate(state.is_crop.tolist()):
-            if not self.left or self.costs.mean(state.units[unit].name) >= self.left:
+            if (
+                not self.left
+                or not self.crew.matchers
+                or self.costs.mean(state.units[unit].name) >= self.left
+            ):
                 phases[:, unit] = NEVER
             elif crop:
                 never = missing[:, :unit] & (phases[:, :unit] == NEVER)
@@ -165,7 +169,7 @@ class Plan:
         had a lost job, and a place that lost its latest job get one unit on one pair, so that another loss has one
         cause.
         """
-        if self.phase == NEVER or not self.crew.matchers:
+        if self.phase == NEVER:
             return None
         state, costs = self.state, self.costs
         order = self._order()
@@ -232,49 +236,36 @@ class Plan:
 
     @cached_property
     def scenes(self) -> list[tuple[int, int]]:
-        """The scenes to make now, as (batch, candidate); batches without any scene come first."""
-        state, crew = self.state, self.crew
-        is_matching = self.match is not None or state.is_matching
-        most = crew.beside if is_matching else crew.scenes
-        held, held_later = self._held(is_matching=is_matching)
-        due = state.missing_scenes & (state.scene_matches > 0)
-        due[:, 0] &= ~np.where(state.has_scene, held_later, held)
-        # Further candidates wait for the end of matching, and must be expected to end in time.
-        due[:, 1:] &= ~(state.stale | held_later | is_matching)[:, None]
+        """The scenes to make now, as (batch, candidate); batches without any scene come first.
+
+        A first scene waits for units that fit in time and for estimates, a later scene for all units. Further
+        candidates wait for the end of matching, and must be expected to end in time.
+        """
+        state = self.state
+        busy = state.busy < NEVER
+        pending = state.estimating | self._due
+        later = pending | busy | (self.first < NEVER)
+        # In the last phase, a pair of each batch is always being matched. A first scene takes the present points:
+        # any scene is better than none, and its time helps to forecast the others.
+        held = pending & ~state.has_f if self.phase == FILL else pending
+        held = held | (self.first < FILL) | (state.busy < FILL)
+        if not self.left:
+            # No unit begins any more, and it is too late to wait for estimates. A hung job may last until the end.
+            held, later = np.zeros_like(busy), busy
+        waits = np.where(state.has_scene, state.by_batch(later), state.by_batch(held)) > 0
+        is_matching = self.match is not None or bool(busy.any())
+        due = state.missing_scenes & (state.scene_matches > 0) & ~waits[:, None]
         ends = self.now + self.costs.scenes(state.scene_matches)
-        due[:, 1:] &= (ends <= self.budget.stop_units)[:, 1:]
+        in_time = (ends <= self.budget.stop_units) & ~state.stale[:, None] & (not is_matching)
+        due[:, 1:] &= in_time[:, 1:]
         for each in state.making:
             due[each] = False
         # Each batch gets its second candidate before any gets a third.
         batches = np.argsort(state.has_scene, kind="stable")
         candidates, order = np.nonzero(due[batches].T)
         found = zip(batches[order].tolist(), candidates.tolist(), strict=True)
+        most = self.crew.beside if is_matching else self.crew.scenes
         return list(found)[: max(0, most - len(state.making))]
-
-    def _held(self, *, is_matching: bool) -> tuple[Mask, Mask]:
-        """Return the batches (B,) whose scenes wait: the first scene, and later ones.
-
-        A first scene waits for units that fit in time and for estimates, later scenes for all units until
-        matching ends.
-        """
-        state = self.state
-        busy = state.busy < NEVER
-        pending = state.estimating | self._due
-        held, later = pending, pending
-        if not self.left:
-            # No unit begins any more, and it is too late to wait for estimates. A hung job may last until the end.
-            held, later = np.zeros_like(busy), busy
-        elif is_matching:
-            # In the last phase, a pair of each batch is always being matched. A first scene takes the present
-            # points: any scene is better than none, and its time helps to forecast the others.
-            held = (first := self.first) < FILL
-            held = (
-                held
-                | (state.busy < FILL)
-                | (pending if self.phase < FILL else pending & ~state.has_f)
-            )
-            later = pending | busy | (first < NEVER)
-        return state.by_batch(held) > 0, state.by_batch(later) > 0
 
 
 def is_complete(state: State, crew: Crew) -> bool:

@@ -3,7 +3,7 @@
 Messages are pickled, so none has a connection, a lock, or a large array that the worker can read itself.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -21,8 +21,6 @@ from mkpc_kaggle.scene.sfm import Solution
 
 if TYPE_CHECKING:
     from mkpc_kaggle.engine.state import State
-
-MIN_PAIRS = 2  # of a batch that is reconstructed: the minimum to connect three images
 
 
 class Ending(StrEnum):
@@ -226,23 +224,3 @@ class Failure:
 # The answer to a match job or an estimate job has a value for each pair, in the order of the job. A matched
 # pair has the results of its job, and no images; its ``failure`` names an unreadable or changed image.
 Answer = Loaded | tuple[PairMatch, ...] | tuple[Estimated, ...] | Solution | Failure
-
-
-# Pairs
-
-
-def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
-    """Return the pair indices of each batch that can be reconstructed, of two or more pairs."""
-    batches: dict[str, list[int]] = {}
-    for index, pair in enumerate(pairs):
-        batches.setdefault(pair.group, []).append(index)
-    return {name: members for name, members in batches.items() if len(members) >= MIN_PAIRS}
-
-
-def visiting_order(pairs: Sequence[Pair]) -> list[int]:
-    """Return pair indices in an order that puts pairs with a common image together, for encoding
-    cache hits.
-    """
-    # The group first: a batch that is finished early gets its scene early.
-    keys = [(pair.group, pair.file0, pair.file1) for pair in pairs]
-    return sorted(range(len(pairs)), key=keys.__getitem__)

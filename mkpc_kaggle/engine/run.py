@@ -162,30 +162,23 @@ class Run:
     # Handing out
 
     def _give(self, place: Place, plan: Plan) -> None:
-        """Give a job to a free place, or start a worker there if there is one to give."""
-        now = plan.now
+        """Give a job to a free place, and start a worker there if it has none."""
         job: Job | None = None
-        if place.kind is Kind.SCENE:
-            if plan.scenes:
-                place.start(now)
-                place.submit(self._scene_job(*plan.scenes.pop(0)), now)
-            return
-        if place.kind is Kind.ESTIMATE:
-            has_work = bool(plan.estimates)
-            if has_work and place.is_idle:
-                job = self._estimate_job(plan.estimates)
-        else:
+        if place.kind is Kind.SCENE and plan.scenes:
+            job = self._scene_job(*plan.scenes.pop(0))
+        elif place.kind is Kind.ESTIMATE and plan.estimates:
+            job = self._estimate_job(plan.estimates)
+        elif place.kind is Kind.MATCH:
             # Again if a former place has taken these pairs, and for a place that continues elsewhere.
             if place.lost or (plan.match and self.state.busy[plan.match.pairs].min() < NEVER):
-                plan = self.plan(now, len(place.lost))
-            has_work = plan.match is not None
+                plan = self.plan(plan.now, len(place.lost))
             if plan.match is not None and place.is_idle:
                 self._show(plan.phase)
                 job = self._match_job(plan.match)
+            elif plan.match is not None:
+                place.start(plan.now)  # loading takes long, and the plan may be another one then
         if job is not None:
-            place.submit(job, now)
-        elif has_work:
-            place.start(now)
+            place.submit(job, plan.now)
 
     def _match_job(self, plan: MatchPlan) -> MatchJob:
         state = self.state
@@ -335,12 +328,13 @@ class Run:
         - A unit that never ran is at fault itself when it was lost on more pairs than there are places. Where a
           place has answered, that does not count against the place.
         """
-        if job is None:
+        if job is not None:
+            self.state.release(job)
+        if job is None or not place.is_loaded:
             self.fault(f"{place.name}: {failure}")
             place.strikes += 1
         else:
             self.fault(f"a job was lost on {place.name}: {failure}")
-            self.state.release(job)
             if isinstance(job, SceneJob):
                 self._lose_scene(job, failure)
             else:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.data.competition import Pair, distinct_pairs, names_of
+from mkpc_kaggle.data.competition import Pair, distinct_pairs, names_of, visiting_order
 from mkpc_kaggle.engine.keys import Images, contents_of, of_candidate
 from mkpc_kaggle.engine.request import (
     Job,
@@ -19,16 +19,13 @@ from mkpc_kaggle.engine.request import (
     PairInputs,
     Request,
     SceneJob,
-    batches_of,
-    visiting_order,
 )
 from mkpc_kaggle.engine.store import Store
-from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.crop_need import pays
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, are_models
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.candidates import best_of, candidates_of
-from mkpc_kaggle.scene.densify import extra_pairs_of
+from mkpc_kaggle.scene.densify import batches_of, extra_pairs_of
 from mkpc_kaggle.scene.records import NO_CAMERAS, NOT_RECONSTRUCTED, SceneRecord
 from mkpc_kaggle.scene.view_graph import BatchImage
 
@@ -78,6 +75,7 @@ class State:
         unreadable: Mapping[str, str],
     ) -> None:
         self.request = request
+        self.images = images
         distinct, self.pair_of_row = distinct_pairs(request.pairs)
         recipe = request.recipe
         extra = extra_pairs_of(request.pairs, batches_of(request.pairs), recipe.scene)
@@ -88,9 +86,6 @@ class State:
         self.is_crop = np.array([unit.stage == 2 for unit in self.units], bool)
         # Relative to the root, so that a folder that moved keeps its results.
         self.names = [names_of(pair, request.root) for pair in self.pairs]
-        # Nothing is stored of an image that is not known.
-        unknown = {name: BatchImage(name, "", Size(1, 1)) for both in self.names for name in both}
-        self.images = {**unknown, **images}
         # Pairs with a common image are visited together, since its encodings are cached.
         self.order = np.asarray(visiting_order(self.pairs), int)
         self._start_pairs(len(self.pairs), len(self.units))

@@ -7,7 +7,6 @@ The threads of each worker are decided in :mod:`mkpc_kaggle.cores`.
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -30,15 +29,9 @@ from mkpc_kaggle.errors import UserError, shown
 from mkpc_kaggle.matchers import failures
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.scene.candidates import (
-    ALL_UNITS,
-    candidate_settings,
-    candidate_tracks,
-    disagreement,
-)
+from mkpc_kaggle.scene.candidates import batch_pair, candidate_settings, disagreement
 from mkpc_kaggle.scene.models import models_of
 from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch
-from mkpc_kaggle.scene.view_graph import BatchPair
 
 if TYPE_CHECKING:
     from mkpc_kaggle.pipeline.stages import Pipeline
@@ -185,10 +178,9 @@ def compute_scene(job: Job) -> Solution:
     """
     recipe = job.recipe
     assert isinstance(job, SceneJob) and recipe.scene is not None
-    is_whole = job.folder is not None
     pairs = [
-        batch_pair(*pair, keeps_paths=is_whole, candidate=job.candidate)
-        for pair in with_points(job)
+        batch_pair(pair.images, results, pair.own, job.candidate)
+        for pair, results in with_points(job)
     ]
     solution = reconstruct_batch(
         pairs,
@@ -200,26 +192,6 @@ def compute_scene(job: Job) -> Solution:
     )
     value = disagreement(pairs, models_of(solution.reconstructions))
     return replace(solution, disagreement=value)
-
-
-def batch_pair(
-    pair: PairInputs,
-    results: tuple[UnitResult, ...],
-    *,
-    keeps_paths: bool,
-    candidate: str = ALL_UNITS,
-) -> BatchPair:
-    """Return a pair of a batch with its points, and the tracks of a candidate.
-
-    Images have their file names. With ``keeps_paths`` they have their paths below the root, as in
-    COLMAP's files, in tables of intrinsics and in the cameras of an earlier run.
-    """
-    image0, image1 = (
-        image if keeps_paths else replace(image, name=Path(image.name).name)
-        for image in pair.images
-    )
-    by_unit = tuple(result.matches for result in results)
-    return BatchPair(image0, image1, by_unit, pair.own, candidate_tracks(results, candidate))
 
 
 def with_points(job: Job) -> list[tuple[PairInputs, tuple[UnitResult, ...]]]:

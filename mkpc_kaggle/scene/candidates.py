@@ -19,7 +19,7 @@ from mkpc_kaggle.geometry.metrics import pose_error
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import SceneConfig, Unit
 from mkpc_kaggle.scene.models import SfmModel
-from mkpc_kaggle.scene.view_graph import BatchPair, tracks_of
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 
 # Candidates with tracks of all units, on all edges or on edges with enough support
 # (:func:`mkpc_kaggle.scene.view_graph.supported`); each other candidate has the name of its unit.
@@ -54,6 +54,17 @@ def candidate_tracks(results: Sequence[UnitResult], candidate: str) -> Matches:
     return Matches.concatenate(
         result.matches for result in results if result.unit.name == candidate
     )
+
+
+def batch_pair(
+    images: tuple[BatchImage, BatchImage],
+    results: Sequence[UnitResult],
+    own: Matrix3 | None,
+    candidate: str,
+) -> BatchPair:
+    """Return a pair of a batch with its points, and the tracks of a candidate."""
+    by_unit = tuple(result.matches for result in results)
+    return BatchPair(*images, by_unit, own, candidate_tracks(results, candidate))
 
 
 def disagreement(pairs: Sequence[BatchPair], models: Sequence[SfmModel]) -> float:

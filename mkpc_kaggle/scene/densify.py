@@ -1,16 +1,16 @@
 """Extra pairs, which no row names: they densify the view graph of a batch with few pairs per image.
 
-- Which: :func:`extra_pairs_of` fills each batch of up to 2,000 images, with two or more pairs without known
-  intrinsics, up to ``pairs_per_image`` times as many pairs as images. This number of [scene] is 10 by default;
-  `reconstruct` sets it to 0. The image in the fewest pairs is next, with the image that shares most partners.
+- Which: :func:`extra_pairs_of` fills each batch of up to 2,000 images, with two or more pairs, up to
+  ``pairs_per_image`` times as many pairs as images. This number of [scene] is 10 by default; `reconstruct` sets
+  it to 0. The image in the fewest pairs is next, with the image that shares most partners.
 - How: matched by the unit of the sweep alone, the recipe's first one of stage 1 that can run, and without an F,
   because they serve scenes alone.
 - When: with [scene], in the phase *Connect*, after the sweep and before any other unit, for up to a tenth of the
-  time that is left then (``pairs_to_connect`` of :mod:`mkpc_kaggle.engine.plan`). Pairs of the sparsest
+  time that is left then (:attr:`mkpc_kaggle.engine.plan.Plan.extra`). Pairs of the sparsest
   batches are kept first.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from math import ceil
 from pathlib import Path
 from typing import TypeAlias
@@ -20,9 +20,18 @@ import numpy as np
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.recipe import SceneConfig
 
+MIN_PAIRS = 2  # of a batch that is reconstructed: the minimum to connect three images
 MAX_IMAGES = 2000  # the search is quadratic in the number of images
 
 IndexPair: TypeAlias = tuple[int, int]  # indices of a pair's two images, the smaller first
+
+
+def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
+    """Return the pair indices of each batch that can be reconstructed, of two or more pairs."""
+    batches: dict[str, list[int]] = {}
+    for index, pair in enumerate(pairs):
+        batches.setdefault(pair.group, []).append(index)
+    return {name: members for name, members in batches.items() if len(members) >= MIN_PAIRS}
 
 
 def extra_pairs_of(
