@@ -77,7 +77,7 @@ def restored(scenario: Scenario, store: Store) -> State:
     pairs = [Pair(str(n), f"{int(n * share):03d}", f"{n:07d}", "b") for n in range(scenario.pairs)]
     names = {name for pair in pairs for name in (pair.file0, pair.file1)}
     images = {name: BatchImage(name, name, simulator.SIZE) for name in names}
-    state = State(Request(pairs, scenario.recipe, scenario.keys), images, {})
+    state = State(Request(pairs, scenario.recipe, scenario.keys), images)
     state.restore(store)
     return state
 

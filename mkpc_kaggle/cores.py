@@ -14,6 +14,15 @@ The number of processes is decided in :mod:`mkpc_kaggle.engine.places`.
 
 import os
 
+# For PyTorch, which reads these once. OpenMP threads that wait for each other then sleep; by default they spin
+# and keep the cores from decoding, MAGSAC and other processes. On Linux, tensors of 2 MiB or more use huge pages:
+# with small pages, allocating a feature map takes as long as some convolutions.
+WORKER_ENVIRONMENT = {
+    "OMP_WAIT_POLICY": "PASSIVE",
+    "GOMP_SPINCOUNT": "0",
+    "THP_MEM_ALLOC_ENABLE": "1",
+}
+
 
 def available_cores() -> int:
     """Return the number of cores that this process may use, by its affinity and its container's quota."""

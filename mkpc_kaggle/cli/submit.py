@@ -68,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
         pairs = read_test_side(arguments.test_dir)
         # The first version precedes the watchdog: a run that starts after its limit must leave a
         # complete file.
-        first_version(pairs, output)
+        first_version(pairs, output, work_dir)
         with options.watched_session(arguments, work_dir, interrupt) as session:
             assembly = options.assembly_of(arguments, interrupt)
             recipe = assembly.recipe

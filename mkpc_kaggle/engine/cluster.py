@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mkpc_kaggle.engine.places import Kind, Place, Site
+from mkpc_kaggle.engine.places import Place, Site
 from mkpc_kaggle.engine.process import EXIT_TIMEOUT_S, ThreadWorker
 from mkpc_kaggle.engine.request import Answer, Cause, Failure
 from mkpc_kaggle.engine.worker import Executor, Maker, MatchRunner, Message, Runner
@@ -25,14 +25,12 @@ from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.setup.assembly import Assembly
 from mkpc_kaggle.version import __version__
 
-REACH_TIMEOUT_S = 5.0  # for a head node to accept a connection
-
 
 class RaySite(Site):
     """Places on the machines of a cluster; see :func:`join`.
 
     Each machine must have the weights, and the ``folders`` with the images. Raises
-    :class:`UserError` if Ray is not installed, and if the cluster cannot be joined or has no CPU.
+    :class:`UserError` if Ray is not installed, and if the cluster cannot be joined.
     """
 
     def __init__(
@@ -73,12 +71,9 @@ class RaySite(Site):
                 self._add(f"gpu {number}", assembly.on("cuda:0"), num_gpus=1)
         else:
             self.matching_cores = self._cores
-            for number, node in enumerate(machines):  # several machines may have the same name
+            for number, node in enumerate(machines):
                 cores = int(node["Resources"]["CPU"])
-                name = f"machine {number} ({node['NodeManagerHostname']})"
-                self._add(name, assembly, threads=cores, num_cpus=cores)
-        if not self.of(Kind.MATCH):
-            raise UserError("the Ray cluster offers neither a CPU nor a GPU")
+                self._add(f"machine {number}", assembly, threads=cores, num_cpus=cores)
 
     def close(self) -> None:
         workers = [place.worker for place in self.places if place.worker is not None]
@@ -166,15 +161,6 @@ def join(ray: Any, cluster: str) -> None:
     options: dict[str, Any] = {"include_dashboard": False}
     if address := cluster.partition("://")[2]:
         options = {"address": address}
-        host, _, port = address.rpartition(":")
-        try:  # Ray itself would try for minutes
-            socket.create_connection((host, int(port)), timeout=REACH_TIMEOUT_S).close()
-        except (OSError, OverflowError) as error:  # the second: a port above 65535
-            reason = getattr(error, "strerror", None) or error
-            raise UserError(
-                f"--workers {cluster}: no cluster answers there ({reason}). Start one "
-                "with `ray start --head` and join it from the other machines; it prints the address to use."
-            ) from error
     with ExitStack() as restored:  # Ray replaces this process's signal handlers
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
@@ -182,4 +168,4 @@ def join(ray: Any, cluster: str) -> None:
         try:
             ray.init(**options, log_to_driver=False, logging_level="ERROR")
         except (RuntimeError, ConnectionError, ValueError, OSError) as error:
-            raise UserError(f"the Ray cluster cannot be joined: {error}") from error
+            raise UserError(f"--workers {cluster}: it cannot be joined: {error}") from error

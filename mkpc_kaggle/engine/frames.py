@@ -152,20 +152,19 @@ def results_of(store: Store) -> Results:
     stored = facts.pop("scenes")
     about = About(**{**facts, "ending": Ending(facts["ending"])})
     estimates = {key: json.loads(text) for key, text in store.db.execute(ESTIMATES)}
+    estimates[""] = {"F": None, "magsac": None, "inliers": {}}  # of a pair without one
     units = unit_rows(store, estimates)
     pairs = frame_of(store, PAIRS)
-    of_pair = units.groupby("number")
-    pairs["units"] = of_pair.size().reindex(pairs.index, fill_value=0)
-    for name in ("matches", "inliers"):
-        pairs[name] = of_pair[name].sum().reindex(pairs.index, fill_value=0)
-    found = [estimates.get(key, {}) for key in pairs.pop("estimate")]
+    sums = units.assign(units=1).groupby("number")[["units", "matches", "inliers"]].sum()
+    pairs[sums.columns] = sums.reindex(pairs.index, fill_value=0)
+    found = [estimates[key] for key in pairs.pop("estimate")]
     # A failed estimate has its reason. Without one, a pair has that of a lost job.
     pairs["failure"] = [
         each.get("failure", error or NOT_REACHED)
         for each, error in zip(found, pairs["error"], strict=True)
     ]
-    pairs["own"] = [each.get("F") for each in found]
-    pairs["magsac"] = [each.get("magsac") for each in found]
+    pairs["own"] = [each["F"] for each in found]
+    pairs["magsac"] = [each["magsac"] for each in found]
     elements = np.frombuffer(b"".join(pairs.pop("F"))).reshape(-1, 9)
     pairs[ELEMENTS] = DataFrame(elements, index=pairs.index)
     images = frame_of(store, IMAGES)
@@ -211,7 +210,7 @@ def unit_rows(store: Store, estimates: Mapping[str, Mapping[str, Any]]) -> "Data
     # Points that the pair does not need under today's rule are not used.
     units["matches"] *= units["is_needed"]
     units["inliers"] = [
-        estimates[estimate]["inliers"].get(key, 0) if estimate in estimates else 0
+        estimates[estimate]["inliers"].get(key, 0)
         for estimate, key in zip(units["estimate"], units["key"], strict=True)
     ]
     return units
@@ -246,10 +245,19 @@ def scene_table(
         placed = {row[CAMERAS.index("digest")] for row in scene.cameras}
         names = files.get(scene.batch, list(digests))
         missing = tuple(name for name in names if digests.get(name) not in placed)
-        counts = (len(names), len(names) - len(missing), len(scene.clouds), scene.points)
-        sizes = (scene.reprojection_error, scene.seconds)
-        text = (title_of(scene.candidate), scene.failure)
-        table.append((scene.batch, *counts, *sizes, *text, missing))
+        row = (
+            scene.batch,
+            len(names),
+            len(names) - len(missing),
+            len(scene.clouds),
+            scene.points,
+            scene.reprojection_error,
+            scene.seconds,
+            title_of(scene.candidate),
+            scene.failure,
+            missing,
+        )
+        table.append(row)
     return DataFrame(table, columns=SCENE_COLUMNS)
 
 

@@ -141,9 +141,9 @@ def read_images(
     files: Mapping[str, Path],
     is_over: Callable[[], bool],
     progress: Progress,
-) -> tuple[dict[str, BatchImage], dict[str, str]]:
-    """Return digest, size and focal length of each image by name, and why some cannot be read: their digest is
-    empty, and so is that of an image that was not reached in time.
+) -> dict[str, BatchImage]:
+    """Return digest, size and focal length of each image by name. The digest of an image that cannot be read, or
+    was not reached in time, is empty.
 
     Stored facts of files whose size and time have not changed are used, and new ones are stored. A run reads each
     photograph once before its first job: photographs do not change during a run.
@@ -151,7 +151,6 @@ def read_images(
     columns = "name, size, changed, digest, width, height, focal"
     states = {name: file_state(path) for name, path in files.items()}
     images = {name: BatchImage(name, "", Size(1, 1)) for name in files}
-    unreadable: dict[str, str] = {}
     for name, *state, content, width, height, focal in store.select("image", columns, files):
         # A missing file keeps its results: perhaps nothing must be matched.
         if states[name] in (tuple(state), (0, 0)):
@@ -165,9 +164,7 @@ def read_images(
         progress.count("reading", len(new) - len(pending), len(new), "image")
         rows = []
         for name, facts in (future.result() for future in done):
-            if isinstance(facts, Unreadable):
-                unreadable[name] = str(facts)
-            else:
+            if not isinstance(facts, Unreadable):
                 images[name] = BatchImage(name, *facts)
                 content, size, focal = facts
                 rows.append((name, *states[name], content, *size, focal))
@@ -176,4 +173,4 @@ def read_images(
     # Do not wait for the threads at work: a file of many GB takes long.
     pool.shutdown(wait=False, cancel_futures=True)
     progress.close()
-    return images, unreadable
+    return images

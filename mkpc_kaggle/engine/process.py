@@ -23,18 +23,11 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import cast
 
+from mkpc_kaggle.cores import WORKER_ENVIRONMENT
 from mkpc_kaggle.engine.request import Answer, Cause, Failure, Job
 from mkpc_kaggle.engine.worker import Executor, Maker, Message, Runner, failure_of
 from mkpc_kaggle.signals import end_with_parent
 
-# For PyTorch, which reads these once. OpenMP threads that wait for each other then sleep; by default they spin
-# and keep the cores from decoding, MAGSAC and other processes. On Linux, tensors of 2 MiB or more use huge pages:
-# with small pages, allocating a feature map takes as long as some convolutions.
-WORKER_ENVIRONMENT = {
-    "OMP_WAIT_POLICY": "PASSIVE",
-    "GOMP_SPINCOUNT": "0",
-    "THP_MEM_ALLOC_ENABLE": "1",
-}
 _environment = threading.Lock()  # two threads may start processes at a time
 EXIT_TIMEOUT_S = 5.0  # for a process to end after its pipe has closed
 

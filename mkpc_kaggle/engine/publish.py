@@ -104,9 +104,10 @@ class Publication:
         """Return name, key, need and failure of each unit of a pair that has points, or a failure."""
         state = self._state
         reasons = state.reasons.get(index, {})
-        facts = [facts[index].tolist() for facts in (state.points, state.done, state.needed)]
+        facts = (facts[index].tolist() for facts in (state.points, state.done, state.needed))
         units = []
-        for name, key, is_done, is_needed in zip(state.number_of, *facts, strict=True):
+        for unit, key, is_done, is_needed in zip(state.units, *facts, strict=True):
+            name = unit.name
             if is_done:
                 units.append((name, key.decode(), is_needed, ""))
             elif name in reasons:

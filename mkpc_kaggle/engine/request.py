@@ -192,7 +192,7 @@ class Loaded:
 
 @dataclass(frozen=True, eq=False)
 class Estimated:
-    """The estimate of a pair as facts for the store, see :func:`mkpc_kaggle.engine.worker.estimate_pair`."""
+    """The estimate of a pair as facts for the store, see :meth:`mkpc_kaggle.pipeline.pair.PairMatch.facts`."""
 
     facts: Mapping[str, Any]
     seconds: float = 0.0

@@ -81,7 +81,6 @@ class Run:
         self.about.resumed = int((state.done.all(1) & state.estimated)[: state.rows].sum())
         self.publication = Publication(state, store, budget)
         self._progress = progress
-        self._phase = NEVER  # that was logged last
         self._has_loaded = False  # some worker of matching was ready
         # For the report: an interrupted program has two seconds for it, and the import takes one.
         import_module("pandas")
@@ -173,7 +172,8 @@ class Run:
             if place.lost or (plan.match and self.state.busy[plan.match.pairs].min() < NEVER):
                 plan = self.plan(plan.now, len(place.lost))
             if plan.match is not None and place.is_idle:
-                self._show(plan.phase)
+                done = self.state.done[: self.state.rows]
+                self._progress.count(PHASES[plan.phase], int(done.sum()), done.size, "unit")
                 job = self._match_job(plan.match)
             elif plan.match is not None:
                 place.start(plan.now)  # loading takes long, and the plan may be another one then
@@ -184,7 +184,7 @@ class Run:
         state = self.state
         # The points that the last crop comes from; the worker leaves out those after an earlier one.
         last = max((unit for unit in plan.units if state.is_crop[unit]), default=0)
-        pairs = tuple(state.inputs_of(pair, state.points_before(pair, last)) for pair in plan.pairs)
+        pairs = tuple(state.inputs_of(pair, state.before[last]) for pair in plan.pairs)
         state.busy[plan.pairs] = plan.phase
         upcoming = [path for index in plan.upcoming for path in state.pairs[index].images]
         # To another machine, if the worker is there
@@ -248,7 +248,7 @@ class Run:
             if outcome.failure:
                 state.note_unreadable(index, outcome.failure)
             for result in outcome.results:
-                unit = state.number_of[result.unit.name]
+                unit = state.units.index(result.unit)
                 # Failures are not stored: the next run tries them again.
                 if result.failure:
                     state.losses[index, unit] = RAISED
@@ -347,13 +347,10 @@ class Run:
     def _lose_scene(self, job: SceneJob, failure: Failure) -> None:
         self.fault(f"{job} was not reconstructed: {failure}")
         state = self.state
-        state.scene_losses[job.scene] += 1
-        if (
-            not job.candidate
-            and state.stale[job.scene[0]]
-            and state.scene_losses[job.scene] >= GIVEN_UP
-        ):
-            state.scene_failures[job.scene[0]] = str(failure)
+        batch, candidate = job.scene
+        state.scene_losses[batch, candidate] += 1
+        if not candidate and state.scene_losses[batch, candidate] == GIVEN_UP:
+            state.scene_failures[batch] = str(failure)
 
     def _lose_pairs(self, place: Place, job: Job, failure: Failure) -> None:
         state = self.state
@@ -364,16 +361,16 @@ class Run:
             place.note_answer()
             return
         blamed: list[int] = []
-        is_match = isinstance(job, MatchJob)
-        if isinstance(job, MatchJob) and not any(self.costs.mean(each.name) for each in job.units):
-            blamed = job.plan.units
+        units = job.units if isinstance(job, MatchJob) else []
+        if is_fresh and not any(self.costs.mean(unit.name) for unit in units):
+            blamed = [state.units.index(unit) for unit in units]
+        state.unit_losses[blamed] += 1
+        place.lost.append((job, blamed))
         if is_fresh:
-            state.unit_losses[blamed] += 1
             self._skip_units(failure)
-            place.strikes += not place.has_answered or (is_match and not blamed)
-        elif is_match and not place.has_answered and self.site.has_other(place):
+            place.strikes += not place.has_answered or (bool(units) and not blamed)
+        elif units and not place.has_answered and self.site.has_other(place):
             place.strikes = MAX_LOSSES
-        place.lost.append((job, blamed if is_fresh else []))
 
     def _skip_units(self, failure: Failure) -> None:
         """Skip the units that never ran, and were lost on more pairs than there are places."""
@@ -388,8 +385,7 @@ class Run:
         """Start no worker at a place any more, and take back its losses."""
         state = self.state
         place.closed = f"{place.name}: {failure}"
-        again = f"; {plural(len(place.lost), 'lost job')} tried again" if place.lost else ""
-        self.fault(f"no worker is started any more on {place.closed}{again}")
+        self.fault(f"no worker is started any more on {place.closed}")
         for job, blamed in place.lost:
             state.take_back(job)
             state.unit_losses[blamed] -= 1
@@ -420,14 +416,6 @@ class Run:
     def _say(self, text: str) -> None:
         self._progress.note(text)
         logger.debug(text)
-
-    def _show(self, phase: int) -> None:
-        """Show the phase and the units that are done; a change of phase is a line of the log."""
-        done = self.state.done[: self.state.rows]
-        self._progress.count(PHASES[phase], int(done.sum()), done.size, "unit")
-        if phase != self._phase:
-            self._phase = phase
-            logger.debug(PHASES[phase])
 
     # The end
 

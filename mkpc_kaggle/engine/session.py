@@ -1,7 +1,6 @@
 """Assembly of a run: store, site, signal handling, and the end at the time limit."""
 
 import hashlib
-import platform
 import shutil
 import threading
 import time
@@ -9,20 +8,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from importlib import metadata
 from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryFile
 from types import MappingProxyType
 from typing import Self
 
-import cv2
-import numpy as np
-
 from mkpc_kaggle.data.competition import (
     Pair,
     names_of,
-    read_submission,
     submission_problem,
     write_submission,
 )
@@ -37,13 +31,11 @@ from mkpc_kaggle.engine.run import Run
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.errors import UserError, writing
-from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.recipe import PINHOLES
 from mkpc_kaggle.setup.assembly import Assembly
 from mkpc_kaggle.setup.console import LOG_NAME, Progress, leave, logged, logger
 from mkpc_kaggle.signals import Interrupt
-from mkpc_kaggle.version import __version__
 
 WORKERS_LOG = "workers.log"  # in the work directory, for the output of native libraries
 EXIT_S = 0.2  # for the system to end a process
@@ -118,43 +110,11 @@ class Session:
         leave(128 + self.interrupt.signal if self.interrupt.signal else status, EXIT_S / 4)
 
 
-def submit(
-    pairs: Sequence[Pair],
-    assembly: Assembly,
-    session: Session,
-    output: Path,
-    root: str = "",
-) -> Results:
-    """Match all pairs. ``output`` always has a row for each pair, with the fallback F if necessary.
+def first_version(pairs: Sequence[Pair], output: Path, work_dir: Path) -> None:
+    """Write fallback rows before using weights, devices or images, which may hang.
 
-    A complete file of an earlier run is kept in the work directory, since this run begins without its results.
-    """
-    ids = [pair.id for pair in pairs]
-    former: dict[str, Matrix3] = {}
-    with suppress(UserError):  # it is missing
-        former = {} if submission_problem(output, ids) else read_submission(output)
-
-    def publish(state: State) -> None:
-        rows = dict(zip(ids, state.fundamentals, strict=True))
-        if any(_is_fallback(rows[each]) and not _is_fallback(F) for each, F in former.items()):
-            # By content: a run that begins often keeps each version once.
-            name = hashlib.blake2b(output.read_bytes(), digest_size=4).hexdigest()
-            shutil.copyfile(output, session.work_dir / f"earlier-{name}.csv")
-        former.clear()
-        write_submission(output, rows)
-
-    return run_pairs(pairs, assembly, session, root, publish=publish)
-
-
-def _is_fallback(F: Matrix3) -> bool:
-    return bool(np.allclose(F, FALLBACK_FUNDAMENTAL))
-
-
-def first_version(pairs: Sequence[Pair], output: Path) -> None:
-    """Write fallback rows, unless the file is complete, before using weights, devices or images,
-    which may hang.
-
-    Raises :class:`mkpc_kaggle.errors.UserError` if ``output`` cannot be written.
+    A complete file of an earlier run stays, and a copy of it in the work directory, since the next version is that
+    of a run without its results. Raises :class:`mkpc_kaggle.errors.UserError` if ``output`` cannot be written.
     """
     if output.is_char_device() or output.is_block_device():
         raise UserError(f"--output {output} is a device; name a file")
@@ -162,8 +122,29 @@ def first_version(pairs: Sequence[Pair], output: Path) -> None:
     with writing(f"--output {output}"):
         output.parent.mkdir(parents=True, exist_ok=True)
         TemporaryFile(dir=output.parent).close()  # before hours of work, not after them
-        if not output.exists() or (output.is_file() and submission_problem(output, ids)):
+        if output.is_file() and not submission_problem(output, ids):
+            # By content: a run that begins often keeps each version once.
+            name = hashlib.blake2b(output.read_bytes(), digest_size=4).hexdigest()
+            work_dir.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(output, work_dir / f"earlier-{name}.csv")
+        else:
             write_submission(output, dict.fromkeys(ids, FALLBACK_FUNDAMENTAL))
+
+
+def submit(
+    pairs: Sequence[Pair],
+    assembly: Assembly,
+    session: Session,
+    output: Path,
+    root: str = "",
+) -> Results:
+    """Match all pairs. ``output`` always has a row for each pair, with the fallback F if necessary."""
+    ids = [pair.id for pair in pairs]
+
+    def publish(state: State) -> None:
+        write_submission(output, dict(zip(ids, state.fundamentals, strict=True)))
+
+    return run_pairs(pairs, assembly, session, root, publish=publish)
 
 
 def run_pairs(
@@ -195,7 +176,7 @@ def run_pairs(
         str(assembly.placement),
         budget.time_limit if isfinite(budget.time_limit) else None,
         assembly.left_out,
-        versions(),
+        assembly.versions,
         dict(files),
     )
     keys = Keys.of(assembly)
@@ -204,32 +185,20 @@ def run_pairs(
     )
     with Store.open(work_dir, fresh=session.fresh) as store:
         # The workers' log is that of this run.
-        for name in (WORKERS_LOG, LOG_NAME) if session.fresh else (WORKERS_LOG,):
-            with suppress(OSError):
-                (work_dir / name).unlink(missing_ok=True)
+        with suppress(OSError):
+            (work_dir / WORKERS_LOG).unlink(missing_ok=True)
         images: dict[str, Path] = {}
         for pair in pairs:
             images |= zip(names_of(pair, root), pair.images, strict=True)
         progress = Progress(budget.left, is_shown=session.progress)
         is_over = partial(budget.is_over, session.interrupt)
-        facts = read_images(store, images, is_over, progress)
-        state = State(request, *facts)
+        state = State(request, read_images(store, images, is_over, progress))
         state.restore(store)
         site = _site(pairs, assembly, session)
         run = Run(state, site, store, budget, session.interrupt, progress)
         session.save = run.publication.save
         with logged(work_dir / LOG_NAME):
             return run.report()
-
-
-def versions() -> dict[str, str]:
-    """Return versions for readers of a report. Keys have only those that change a kind of result for sure."""
-    return {
-        "mkpc_kaggle": __version__,
-        "Python": platform.python_version(),
-        "PyTorch": metadata.version("torch"),
-        "OpenCV": cv2.__version__,
-    }
 
 
 def _site(pairs: Sequence[Pair], assembly: Assembly, session: Session) -> Site:

@@ -68,12 +68,7 @@ class State:
     ``batch_of`` (N,) is -1 for a pair without a batch.
     """
 
-    def __init__(
-        self,
-        request: Request,
-        images: Mapping[str, BatchImage],
-        unreadable: Mapping[str, str],
-    ) -> None:
+    def __init__(self, request: Request, images: Mapping[str, BatchImage]) -> None:
         self.request = request
         self.images = images
         distinct, self.pair_of_row = distinct_pairs(request.pairs)
@@ -82,18 +77,16 @@ class State:
         self.pairs: list[Pair] = [*distinct, *extra]
         self.rows = len(distinct)
         self.units = recipe.units
-        self.number_of = {unit.name: number for number, unit in enumerate(self.units)}
         self.is_crop = np.array([unit.stage == 2 for unit in self.units], bool)
+        # The units of stage 1 before each unit (U, U)
+        self.before = np.tri(len(self.units), k=-1, dtype=bool) & ~self.is_crop
         # Relative to the root, so that a folder that moved keeps its results.
         self.names = [names_of(pair, request.root) for pair in self.pairs]
         # Pairs with a common image are visited together, since its encodings are cached.
         self.order = np.asarray(visiting_order(self.pairs), int)
         self._start_pairs(len(self.pairs), len(self.units))
         self._start_batches()
-        self.titles = [*self.number_of, "estimate"]  # of the columns of losses
-        for index, names in enumerate(self.names):
-            if reasons := [unreadable[name] for name in names if name in unreadable]:
-                self.note_unreadable(index, reasons[0])
+        self.titles = [*(unit.name for unit in self.units), "estimate"]  # of the columns of losses
 
     def _start_pairs(self, count: int, units: int) -> None:
         # Column by column: the plan looks at one unit of all pairs at a time.
@@ -134,23 +127,23 @@ class State:
     @property
     def missing(self) -> Mask:
         """(N, U): today's points are missing, and this run can get them."""
-        return np.asarray(~self.done & (self.losses[:, :-1] < GIVEN_UP) & ~self.dead)
+        return ~self.done & (self.losses[:, :-1] < GIVEN_UP) & ~self.dead
 
     @property
     def used(self) -> Mask:
         """(N, U): the pair has points of the unit."""
-        return np.asarray(self.done & self.needed)
+        return self.done & self.needed
 
     @property
     def is_row(self) -> Mask:
-        return np.asarray(np.arange(len(self.pairs)) < self.rows)
+        return np.arange(len(self.pairs)) < self.rows
 
     @property
     def lacks_estimate(self) -> Mask:
         """(N,): the row's estimate is not from the points in use, and this run can get it."""
         # Extra pairs are for scenes alone.
         is_open = self.is_row & ~self.estimated & (self.losses[:, ESTIMATE] < GIVEN_UP)
-        return np.asarray(is_open & self.used.any(1))
+        return is_open & self.used.any(1)
 
     @property
     def is_suspect(self) -> Mask:
@@ -176,7 +169,7 @@ class State:
     @property
     def scene_matches(self) -> NDArray[np.int_]:
         """The number of matches (B, C) that make a candidate's tracks, about."""
-        columns = {name: self.matches[:, number] for name, number in self.number_of.items()}
+        columns = dict(zip(self.titles, self.matches.T, strict=False))
         every = self.matches.sum(1)
         counts = [self.by_batch(columns.get(name, every)) for name in self.candidates]
         return np.column_stack(counts)
@@ -256,32 +249,26 @@ class State:
     def key(self, index: int, unit: int) -> str:
         """Return today's key of a unit's points on a pair."""
         keys = self.request.keys
-        first = [keys.mkpc, *self.points_before(index, unit).values()] if self.is_crop[unit] else []
+        before = self.points_of(index, self.before[unit]).values()
+        first = [keys.mkpc, *before] if self.is_crop[unit] else []
         return keys.of_points(unit, self.pairs[index], self.images_of(index), first)
 
-    def points_before(self, index: int, unit: int) -> dict[Unit, str]:
-        """Return the keys of the points of stage 1 that a unit's crops come from."""
-        return self._keys(index, self.done[index, :unit] & ~self.is_crop[:unit])
-
-    def points_in_use(self, index: int) -> dict[Unit, str]:
-        return self._keys(index, self.done[index] & self.needed[index])
-
-    def _keys(self, index: int, chosen: Mask) -> dict[Unit, str]:
-        """Return the keys of a pair's points of these units, in the recipe's order."""
-        numbers = np.flatnonzero(chosen).tolist()
+    def points_of(self, index: int, units: Mask | bool = True) -> dict[Unit, str]:
+        """Return the keys of a pair's points in use, by default of all units (U,), in the recipe's order."""
+        numbers = np.flatnonzero(units & self.done[index] & self.needed[index]).tolist()
         return {self.units[number]: self.points[index, number].decode() for number in numbers}
 
     def estimate_key(self, index: int) -> str:
         """Return the key of an estimate from the points in use."""
-        return self.request.keys.of_estimate(self.points_in_use(index).values())
+        return self.request.keys.of_estimate(self.points_of(index).values())
 
-    def inputs_of(self, index: int, points: Mapping[Unit, str] | None = None) -> PairInputs:
-        """Return the inputs of a pair's job: its points in use, or these ``points``."""
+    def inputs_of(self, index: int, units: Mask | bool = True) -> PairInputs:
+        """Return the inputs of a pair's job, with the points in use of these units (U,)."""
         return PairInputs(
             index,
             self.pairs[index],
             self.images_of(index),
-            self.points_in_use(index) if points is None else points,
+            self.points_of(index, units),
             self.estimate[index].decode(),
             self.F[index] if self.has_f[index] else None,
         )

@@ -9,15 +9,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
-import numpy as np
-
 from mkpc_kaggle.cores import limit_matching_threads, limit_to_one_thread
 from mkpc_kaggle.data.images import Image, ImageStore
 from mkpc_kaggle.engine.request import (
     Answer,
     Cause,
     Estimated,
-    EstimateJob,
     Failure,
     Job,
     Loaded,
@@ -28,7 +25,7 @@ from mkpc_kaggle.engine.request import (
 from mkpc_kaggle.errors import UserError, shown
 from mkpc_kaggle.matchers import failures
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
-from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.candidates import batch_pair, candidate_settings, disagreement
 from mkpc_kaggle.scene.models import models_of
 from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch
@@ -138,33 +135,17 @@ def estimates_runner(*, in_process: bool = True) -> Runner:
 
 
 def do_estimates_job(job: Job) -> tuple[Estimated, ...]:
-    """Return the estimates of a job's pairs."""
-    assert isinstance(job, EstimateJob)
-    return tuple(estimate_pair(pair, results, job.recipe) for pair, results in with_points(job))
-
-
-def estimate_pair(pair: PairInputs, results: tuple[UnitResult, ...], recipe: Recipe) -> Estimated:
-    """Estimate F of a pair from its points of all units. The store has these facts.
-
-    ``F`` and ``magsac``, that before the prior, are nine numbers, row by row. ``inliers`` has a count for each key
-    of points.
-    """
-    start = time.perf_counter()
-    # From the digested contents, so the images are not decoded again.
-    sizes = tuple(image.size for image in pair.images)
-    focals = tuple(image.focal for image in pair.images)
-    match = PairMatch(results, sizes=sizes, focals=focals)
-    found = with_estimate(match, recipe).estimate
-    # The inliers of each unit, by the bounds of its matches among all
-    counts = [len(result.matches) for result in results]
-    inliers = [int(mask.sum()) for mask in np.split(found.inliers, np.cumsum(counts)[:-1])]
-    facts = {
-        "F": found.matrix.ravel().tolist(),
-        "failure": found.failure,
-        "magsac": None if found.magsac is None else found.magsac.ravel().tolist(),
-        "inliers": dict(zip(pair.points.values(), inliers, strict=True)),
-    }
-    return Estimated(facts, time.perf_counter() - start)
+    """Return the estimates of a job's pairs, each from its points of all units."""
+    estimates = []
+    for pair, results in with_points(job):
+        start = time.perf_counter()
+        # From the digested contents, so the images are not decoded again.
+        sizes = tuple(image.size for image in pair.images)
+        focals = tuple(image.focal for image in pair.images)
+        match = with_estimate(PairMatch(results, sizes=sizes, focals=focals), job.recipe)
+        facts = match.facts(pair.points.values())
+        estimates.append(Estimated(facts, time.perf_counter() - start))
+    return tuple(estimates)
 
 
 def scene_runner() -> Runner:

@@ -1,5 +1,6 @@
 """A pair on its way through the stages: results of units, critical regions, the two-view model."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -110,6 +111,23 @@ class PairMatch:
         from mkpc_kaggle.pipeline.drawing import draw_pair  # it draws this class
 
         return draw_pair((as_image(image0), as_image(image1)), self)
+
+    def facts(self, keys: Iterable[str]) -> dict[str, object]:
+        """Return the estimate as JSON values, under the names that they have in a store.
+
+        ``F`` and ``magsac``, that before the prior, are nine numbers, row by row. ``inliers`` has a count for each
+        result, by its key.
+        """
+        found = self.estimate
+        # The inliers of each unit, by the bounds of its matches among all
+        bounds = np.cumsum([len(result.matches) for result in self.results])
+        masks = np.split(found.inliers, bounds[:-1])
+        return {
+            "F": found.matrix.ravel().tolist(),
+            "failure": found.failure,
+            "magsac": None if found.magsac is None else found.magsac.ravel().tolist(),
+            "inliers": {key: int(mask.sum()) for key, mask in zip(keys, masks, strict=True)},
+        }
 
     def in_stage(self, stage: int) -> NDArray[np.bool_]:
         """Return the (N,) mask of the ``matches`` that units of this stage found."""

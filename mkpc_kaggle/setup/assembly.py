@@ -5,6 +5,7 @@ other recipe is refused, with the command that fetches the weights.
 """
 
 import os
+import platform
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -24,6 +25,7 @@ from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.devices import AUTO, gpus_of, resolve_placement
 from mkpc_kaggle.matchers.registry import MATCHERS, load_matcher, require_matchers, spec_of
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe, recipe_names, with_settings
+from mkpc_kaggle.version import __version__
 from mkpc_kaggle.weights import FoundFile, WeightStore
 
 PathSource: TypeAlias = str | os.PathLike[str]
@@ -68,6 +70,16 @@ class Assembly:
 
     def on_cpu(self) -> "Assembly":
         return replace(self, placement=Placement(), sharing=1)
+
+    @property
+    def versions(self) -> dict[str, str]:
+        """Versions for readers of a report. Keys have only those that change a kind of result for sure."""
+        return {
+            "mkpc_kaggle": __version__,
+            "Python": platform.python_version(),
+            "PyTorch": metadata.version("torch"),
+            "OpenCV": cv2.__version__,
+        }
 
     def unit_settings(self, unit: Unit) -> dict[str, Any]:
         """Return all settings that determine a unit's points on given views, as JSON values."""

@@ -55,7 +55,7 @@ class Planned:
         for number in range(count + extra):
             name = f"{number:03d}"  # its order as text is that of the numbers
             pairs.append(Pair(name, "", f"{name}.png", f"{name}b.png"))
-        self.state = State(Request(pairs, recipe, keys_of(recipe)), {}, {})
+        self.state = State(Request(pairs, recipe, keys_of(recipe)), {})
         self.state.rows = count
         self.costs = Costs()
         self.budget = Budget(0.0, limit, lambda: 0.0)

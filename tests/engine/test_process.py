@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 from faulty import choose_scene_for_all_but_the_first, on_fork, runner
 
-from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
+from mkpc_kaggle.cores import WORKER_ENVIRONMENT
+from mkpc_kaggle.engine.process import ProcessWorker
 from mkpc_kaggle.engine.request import Cause, Failure, Loaded, SceneJob
 from mkpc_kaggle.engine.store import Source
 from mkpc_kaggle.geometry.coordinates import Size
@@ -135,7 +136,7 @@ def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path, is_s
 CHECKS = """
 import signal
 from pathlib import Path
-from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT
+from mkpc_kaggle.cores import WORKER_ENVIRONMENT
 
 def check():
     entries = Path("/proc/self/environ").read_text().split(chr(0))
@@ -148,7 +149,8 @@ STARTS = """
 import os, signal, threading
 from checks import check
 from mkpc_kaggle.engine.request import Loaded
-from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
+from mkpc_kaggle.cores import WORKER_ENVIRONMENT
+from mkpc_kaggle.engine.process import ProcessWorker
 
 answers = threading.Semaphore(0)
 worker = ProcessWorker("scene", check, answers.release)

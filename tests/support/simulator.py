@@ -534,7 +534,7 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
     publish = lambda state: published.append(len(state.fundamentals))  # noqa: E731
     about = About({"scene": {}} if scenario.batches else {})
     request = Request(pairs, scenario.recipe, scenario.keys, about=about, publish=publish)
-    state = State(request, {name: BatchImage(name, name, SIZE) for name in names}, {})
+    state = State(request, {name: BatchImage(name, name, SIZE) for name in names})
     state.restore(store)
     run = Run(state, site, store, time, interrupt, Progress(is_shown=False))
 

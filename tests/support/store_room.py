@@ -75,7 +75,7 @@ def state_of(
         for name in names
     }
     about = About({**recipe.table(), "name": "x"})
-    return State(Request(pairs, recipe, keys_of(recipe, **other), about=about), images, {})
+    return State(Request(pairs, recipe, keys_of(recipe, **other), about=about), images)
 
 
 def memory_store(directory: Path = Path()) -> Store:
