@@ -20,7 +20,7 @@ from benchmarks.gpu.faults import EVENTS, Fault
 from benchmarks.gpu.record import EXPECTED, Part
 from benchmarks.gpu.setup import Setup
 from benchmarks.gpu.trained import SLOTS
-from mkpc_kaggle.data.competition import read_test_side, submission_problems
+from mkpc_kaggle.data.competition import read_test_side, submission_problem
 from mkpc_kaggle.engine.frames import results
 from mkpc_kaggle.weights import WeightStore
 
@@ -233,8 +233,7 @@ def _run(case: Case, recipe: Path, setup: Setup, seconds: float, limit: int) -> 
         units = results(home / "submission.work").units
         counts = units[units["failure"] == ""]["pair"].value_counts()
         good = {str(pair): int(count) for pair, count in counts.items()}
-    problems = submission_problems(output, [pair.id for pair in pairs])
-    rows = "; ".join(map(str, problems))
+    rows = submission_problem(output, [pair.id for pair in pairs])
     return Outcome(
         status,
         text,

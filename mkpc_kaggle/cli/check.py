@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from mkpc_kaggle.data.competition import read_test_side, submission_problems
+from mkpc_kaggle.data.competition import read_test_side, submission_problem
 from mkpc_kaggle.errors import plural
 
 HELP = """\
@@ -23,9 +23,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     # An unreadable test side is an error, an unreadable submission is a problem.
     pairs = read_test_side(arguments.test_dir)
-    problems = submission_problems(arguments.submission, [pair.id for pair in pairs])
-    if not problems:
-        print(f"good: {plural(len(pairs), 'row')}")
-        return 0
-    print(f"{arguments.submission}: {plural(len(problems), 'problem')}, the first: {problems[0]}")
-    return 1
+    problem = submission_problem(arguments.submission, [pair.id for pair in pairs])
+    print(problem or f"good: {plural(len(pairs), 'row')}")
+    return int(bool(problem))

@@ -115,20 +115,9 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
 
 def missing_line(pairs: Iterable[Pair]) -> str:
     """Return a line on the images of pairs that are missing; empty if all exist."""
-
-    # Each folder is listed once: a network disk takes long to look for each file.
-    @cache
-    def names_in(folder: str) -> set[str]:
-        with suppress(OSError, ValueError):  # the folder is missing, too, or cannot be read
-            return {path.name for path in Path(folder).iterdir()}
-        return set()
-
     wanted = dict.fromkeys(file for pair in pairs for file in (pair.file0, pair.file1))
-    missing = []
-    for file in wanted:
-        folder, _, name = file.rpartition(os.sep)
-        if name not in names_in(folder):
-            missing.append(file)
+    # Path raises for a name that is too long.
+    missing = [file for file in wanted if not os.path.exists(file)]  # noqa: PTH110
     if not missing:
         return ""
     return f"missing: {len(missing)} of {plural(len(wanted), 'image')}, the first is {missing[0]}"
@@ -218,19 +207,19 @@ def read_submission(path: Path) -> dict[str, Matrix3]:
     return found
 
 
-def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
+def submission_problem(path: Path, sample_ids: Sequence[str]) -> str:
     """Return the first wrong line of a submission; empty if the competition accepts the file."""
     wanted = iter(sample_ids)
     try:
         for where, (sample, cell) in read_rows(path, SUBMISSION_COLUMNS):
             expected = next(wanted, "no more rows")
             if sample != expected:
-                return [f"{where}: the sample is {sample}, and {expected} was expected"]
+                return f"{where}: the sample is {sample}, and {expected} was expected"
             if not finite_numbers(cell, where, 9).any():
-                return [f"{where}: the matrix is zero"]
+                return f"{where}: the matrix is zero"
     except UserError as error:
-        return [str(error)]
-    return [f"{path} ends before sample {sample}" for sample in wanted][:1]
+        return str(error)
+    return next((f"{path} ends before sample {sample}" for sample in wanted), "")
 
 
 def read_rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, list[str]]]:

@@ -22,7 +22,7 @@ import numpy as np
 from mkpc_kaggle.data.competition import (
     Pair,
     read_submission,
-    submission_problems,
+    submission_problem,
     write_submission,
 )
 from mkpc_kaggle.data.outputs import remove_unfinished
@@ -132,7 +132,7 @@ def submit(
     ids = [pair.id for pair in pairs]
     former: dict[str, Matrix3] = {}
     with suppress(UserError):  # it is missing
-        former = {} if submission_problems(output, ids) else read_submission(output)
+        former = {} if submission_problem(output, ids) else read_submission(output)
 
     def publish(state: State) -> None:
         rows = dict(zip(ids, state.fundamentals, strict=True))
@@ -162,7 +162,7 @@ def first_version(pairs: Sequence[Pair], output: Path) -> None:
     with writing(f"--output {output}"):
         output.parent.mkdir(parents=True, exist_ok=True)
         TemporaryFile(dir=output.parent).close()  # before hours of work, not after them
-        if not output.exists() or (output.is_file() and submission_problems(output, ids)):
+        if not output.exists() or (output.is_file() and submission_problem(output, ids)):
             write_submission(output, dict.fromkeys(ids, FALLBACK_FUNDAMENTAL))
 
 

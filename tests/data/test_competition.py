@@ -176,7 +176,7 @@ def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):
     assert list(read) == list(rows)
     for name, F in rows.items():
         assert_allclose(read[name], F, rtol=1e-11, atol=0)  # written with twelve digits
-    assert competition.submission_problems(tmp_path / "submission.csv", list(rows)) == []
+    assert competition.submission_problem(tmp_path / "submission.csv", list(rows)) == ""
     write_submission(tmp_path / "x.csv", {"b": EYE, "a": -EYE / 2})
     expected = b"sample_id,fundamental_matrix\n"
     expected += b"b,1 0 0 0 1 0 0 0 1\na,-0.5 -0 -0 -0 -0.5 -0 -0 -0 -0.5\n"
@@ -207,9 +207,9 @@ def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):
 )
 def test_the_first_wrong_line_of_a_submission_is_named(tmp_path, content, says):
     (tmp_path / "x.csv").write_text(content.replace("{F}", "1 2 3 4 5 6 7 8 9"))
-    (problem,) = competition.submission_problems(tmp_path / "x.csv", ["a", "b"])
+    problem = competition.submission_problem(tmp_path / "x.csv", ["a", "b"])
     assert re.search(says, problem)
-    (problem,) = competition.submission_problems(tmp_path / "y.csv", ["a"])
+    problem = competition.submission_problem(tmp_path / "y.csv", ["a"])
     assert "no such file" in problem
 
 
@@ -270,7 +270,7 @@ def test_numbers_are_read_strictly_in_each_table(tmp_path, train, number):
     matrix = f"{number} 2 3 4 5 6 7 8 9"
     submission = tmp_path / "x.csv"
     submission.write_text(f'sample_id,fundamental_matrix\na,"{matrix}"\n', encoding="utf-8")
-    (problem,) = competition.submission_problems(submission, ["a"])
+    problem = competition.submission_problem(submission, ["a"])
     assert "expected 9 finite numbers" in problem
     with pytest.raises(UserError, match="expected 9 finite numbers"):
         read_submission(submission)

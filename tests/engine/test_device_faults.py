@@ -24,7 +24,7 @@ from faulty import (
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matrices, run
 
 from mkpc_kaggle.cli import main, options
-from mkpc_kaggle.data.competition import read_test_side, submission_problems
+from mkpc_kaggle.data.competition import read_test_side, submission_problem
 from mkpc_kaggle.engine.frames import Results
 from mkpc_kaggle.engine.places import Place
 from mkpc_kaggle.engine.request import Ending
@@ -244,7 +244,7 @@ def test_a_run_that_failed_has_exit_status_one_and_a_line(
     assert main(command) == 1
     assert f"the run failed: {told}" in capsys.readouterr().out
     # Failed, but complete: on Kaggle a file with fallback rows still scores.
-    assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
+    assert submission_problem(output, [pair.id for pair in read_test_side(demo.test_dir)]) == ""
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from rectified import THREE_UNITS, RectifiedMatcher, matrices, run, write_pairs
 from shared import write_small_recipe
 
 from mkpc_kaggle.cli import main
-from mkpc_kaggle.data.competition import read_test_side, submission_problems
+from mkpc_kaggle.data.competition import read_test_side, submission_problem
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine import keys, session, worker
 from mkpc_kaggle.engine.frames import matrices_of, results, results_of
@@ -144,7 +144,7 @@ def test_a_submission_that_the_disk_refuses_is_reported_and_the_exit_status_is_o
     output = tmp_path / "submission.csv"
     assert main(["submit", *arguments_of(demo, small_recipe, output), "--workers", "0"]) == 1
     assert "is not the last version" in capsys.readouterr().out
-    assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
+    assert submission_problem(output, [pair.id for pair in read_test_side(demo.test_dir)]) == ""
 
 
 def arguments_of(demo: DemoSet, recipe: Path, output: Path) -> list[str]:
@@ -282,7 +282,7 @@ def test_a_parent_killed_at_any_moment_leaves_a_complete_file_no_orphans_and_a_r
         running.wait()
         submission = tmp_path / "submission.csv"
         if submission.exists():
-            assert submission_problems(submission, [pair.id for pair in pairs]) == []
+            assert submission_problem(submission, [pair.id for pair in pairs]) == ""
         # Its workers notice that soon, even in the middle of a job.
         while started_with(mark):
             time.sleep(0.05)
@@ -377,7 +377,7 @@ def test_a_full_disk_for_the_journal_alone_is_exit_status_one(
     assert main(["submit", *arguments_of(demo, small_recipe, output), "--workers", "0"]) == 1
     said = capsys.readouterr().out
     assert "the journal cannot be written (database or disk is full)" in said
-    assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
+    assert submission_problem(output, [pair.id for pair in read_test_side(demo.test_dir)]) == ""
 
 
 def small_store(

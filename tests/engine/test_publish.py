@@ -8,7 +8,7 @@ import pytest
 from faulty import runner
 from rectified import THREE_UNITS, RectifiedMatcher, run, sources, write_pairs
 
-from mkpc_kaggle.data.competition import submission_problems
+from mkpc_kaggle.data.competition import submission_problem
 from mkpc_kaggle.engine import places
 from mkpc_kaggle.engine.request import Estimated, EstimateJob
 from mkpc_kaggle.engine.worker import do_estimates_job
@@ -31,4 +31,4 @@ def test_a_matrix_that_is_no_f_becomes_the_fallback_and_the_file_is_valid(tmp_pa
     output = tmp_path / "submission.csv"
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", output=output)
     assert sources(report) == ["fallback"]
-    assert submission_problems(output, [pair.id for pair in pairs]) == []
+    assert submission_problem(output, [pair.id for pair in pairs]) == ""

@@ -10,7 +10,7 @@ from genuine import GENUINE, why_not_there
 from kaggle_image import environment, make_image, python_version, upload
 from offline_notebook import execute, needs_namespaces, pictures, printed
 from packaging.requirements import Requirement
-from shared import DATA, WEIGHTS, problems_of
+from shared import DATA, WEIGHTS, problem_of
 
 from mkpc_kaggle.package import COMPETITION, PYTHONS, make_package
 
@@ -65,8 +65,8 @@ class Kaggle:
         shown = [output for cell in cells for output in cell.get("outputs", [])]
         return "".join(output.get("data", {}).get("text/html", "") for output in shown)
 
-    def problems(self) -> list[str]:
-        return problems_of(self.working / "submission.csv", self.test_dir)
+    def problem(self) -> str:
+        return problem_of(self.working / "submission.csv", self.test_dir)
 
 
 @pytest.fixture
@@ -149,7 +149,7 @@ def test_a_saved_version_without_a_network_writes_a_submission_and_shows_pairs(
     assert f"not used     {older}" in printed
     assert [text for text in PRINTED[source] if not re.search(text, printed)] == [], printed
     assert "runs without" not in printed
-    assert kaggle.problems() == []
+    assert kaggle.problem() == ""
     assert "good: 1 row" in printed
     assert "recipe auto" in printed
     assert "of 525 minutes used" in printed
@@ -177,7 +177,7 @@ def test_a_failed_run_fails_the_notebook_but_not_the_hidden_rerun(kaggle, demo, 
     # The hidden run is the only chance: a file of fallback rows is better than none.
     assert "THE RUN FAILED" in kaggle.run(KAGGLE_IS_COMPETITION_RERUN="1")
     assert kaggle.figures() == 0
-    assert kaggle.problems() == []
+    assert kaggle.problem() == ""
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

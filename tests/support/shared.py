@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from mkpc_kaggle.cli import main
-from mkpc_kaggle.data.competition import read_test_side, submission_problems
+from mkpc_kaggle.data.competition import read_test_side, submission_problem
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 DATA = SHARED / "data"
@@ -30,8 +30,8 @@ def run_command(*words: object) -> int:
     return main([*map(str, words)])
 
 
-def problems_of(submission: Path, test_dir: Path) -> list[str]:
-    return submission_problems(submission, [pair.id for pair in read_test_side(test_dir)])
+def problem_of(submission: Path, test_dir: Path) -> str:
+    return submission_problem(submission, [pair.id for pair in read_test_side(test_dir)])
 
 
 def scores_of(out: Path, *options: object) -> dict[str, Any]:
