@@ -76,14 +76,9 @@ def same_file(path: Path, other: Path) -> bool:
 def replacing(path: Path) -> Iterator[TextIO]:
     """Open a temporary file, which replaces ``path`` once the new file is complete and on disk.
 
-    The temporary file lies next to ``path``; files that a killed process left there are removed. A
-    device such as ``/dev/stdout`` is written directly. Raises ``OSError`` and removes the temporary
-    file if writing fails.
+    The temporary file lies next to ``path``; files that a killed process left there are removed.
+    Raises ``OSError`` and removes the temporary file if writing fails.
     """
-    if path.is_char_device():
-        with path.open("w", encoding="utf-8", newline="") as stream:
-            yield stream
-        return
     for left in path.parent.glob(f".{escape(path.name)}.*.part"):
         with suppress(OSError):
             left.unlink()

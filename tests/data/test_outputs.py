@@ -1,8 +1,5 @@
 """Files that a command writes: whole or not at all, never over an input, without remains."""
 
-import os
-from pathlib import Path
-
 import pytest
 
 from mkpc_kaggle.data.outputs import replacing, require_apart
@@ -27,15 +24,3 @@ def test_the_remains_of_a_killed_process_are_removed(tmp_path):
     with replacing(tmp_path / "submission.csv") as stream:
         stream.write("whole")
     assert sorted(path.name for path in tmp_path.iterdir()) == [kept.name, "submission.csv"]
-
-
-def test_a_device_is_written_to_and_not_replaced():
-    # `--csv /dev/stdout` and terminals: a rename would replace the device by a file.
-    ours, terminal = os.openpty()
-    try:
-        with replacing(Path(os.ttyname(terminal))) as stream:
-            stream.write("all of it")
-        assert os.read(ours, 100) == b"all of it"
-    finally:
-        os.close(ours)
-        os.close(terminal)
