@@ -196,7 +196,6 @@ def compute_scene(job: Job) -> Solution:
         recipe.focal,
         recipe.magsac,
         job.folder,
-        is_whole,
         cameras=job.cameras,
     )
     value = disagreement(pairs, models_of(solution.reconstructions))

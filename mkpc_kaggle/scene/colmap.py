@@ -57,7 +57,6 @@ SEED = 0
 # focal lengths of a half to twice the true ones keep 0.998 of the matches of castle_p19 and 0.999 of
 # herz_jesus_p8. Beyond, nothing was measured.
 MAX_FOCAL_CHANGE = 2.0
-DEFAULTS = SceneConfig()
 # Configurations of a two-view geometry whose H was estimated
 WITH_HOMOGRAPHY = (
     pycolmap.TwoViewGeometryConfiguration.PLANAR,
@@ -97,7 +96,7 @@ def write_files(
     merged: MergedGraph,
     shared: SharedIntrinsics,
     models: Sequence[SfmModel],
-    config: SceneConfig = DEFAULTS,
+    config: SceneConfig,
 ) -> None:
     """Write COLMAP's files: the database and one folder per model, in place of ``directory``.
 

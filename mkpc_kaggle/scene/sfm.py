@@ -42,23 +42,22 @@ def reconstruct_batch(
     config: SceneConfig,
     focal: FocalConfig | None = None,
     magsac: RobustConfig | None = None,
-    export: Path | None = None,
-    is_whole: bool = False,
+    folder: Path | None = None,
     *,
     cameras: Rows = (),
 ) -> Solution:
     """Reconstruct every connected component of a batch, and choose an F for each of its pairs.
 
     With the recipe's prior ``focal``, a pair without an F from cameras is re-estimated at the scene's focal
-    lengths, unless the pair contradicts the scene. ``magsac`` has default settings if ``None``. With a directory
-    ``export``, the batch is reconstructed as a whole, and COLMAP's files are written there. With ``is_whole``, it
-    is reconstructed in the same way without files. ``cameras`` are the user's known cameras.
+    lengths, unless the pair contradicts the scene. ``magsac`` has default settings if ``None``. With a
+    ``folder``, the batch is reconstructed as a whole, and COLMAP's files are written there. ``cameras`` are the
+    user's known cameras.
 
     A missing result has a reason; bad matches never raise. Reconstruction takes seconds to minutes
     and may end the process, see :mod:`mkpc_kaggle.scene.colmap`.
     """
     graph = ViewGraph.of_pairs(pairs).with_intrinsics(cameras)
-    reconstructions, shared = reconstruct_graph(graph, config, export, is_whole)
+    reconstructions, shared = reconstruct_graph(graph, config, folder)
     models = [
         {image.image.digest: image for image in model.images}
         for model in models_of(reconstructions)
@@ -75,32 +74,30 @@ def reconstruct_batch(
 def reconstruct_graph(
     graph: ViewGraph,
     config: SceneConfig,
-    directory: Path | None = None,
-    is_whole: bool = False,
+    folder: Path | None = None,
 ) -> tuple[list[Reconstruction], SharedIntrinsics]:
     """Return the reconstruction of each component, and the shared intrinsics of the images, refined.
 
-    With a ``directory``, the graph is reconstructed as a whole, and COLMAP's files are written there.
-    With ``is_whole``, it is reconstructed as a whole without files.
+    With a ``folder``, the graph is reconstructed as a whole, and COLMAP's files are written there.
     """
-    if directory is None and not is_whole:
+    if folder is None:
         # Each component alone, since a bad one may make the mapper fail
         parts = list(map(MergedGraph, graph.components()))
         make = partial(reconstruct_component, config=config)
     else:
         # COLMAP's database holds all images of a folder.
         parts = [MergedGraph(graph.strong)]
-        make = partial(reconstruct_connected, config=config)
+        make = partial(map_graph, config=config)
     # The user's cameras are not shared.
     shared = given_intrinsics(graph.free, config)
     reconstructions = [make(part, shared) for part in parts]
     if config.cameras is CameraSharing.AUTO:
         again = share(parts, reconstructions, graph.free, make)
         reconstructions, shared = again or (reconstructions, shared)
-    if directory is not None:
+    if folder is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
-        write_files(directory, parts[0], shared, models_of(reconstructions), config)
+        write_files(folder, parts[0], shared, models_of(reconstructions), config)
     # Images without a camera have the refined focal length, and not the one it began with.
     if config.cameras is CameraSharing.FOLDER:
         shared = refined_intrinsics(graph.free, models_of(reconstructions))
@@ -128,10 +125,10 @@ def reconstruct_component(
             f"{math.ceil(MIN_PAIRS_PER_IMAGE * images)}; more overlapping images would help"
         )
         return Reconstruction(graph.names, failure=few)
-    return reconstruct_connected(merged, shared, former, config=config)
+    return map_graph(merged, shared, former, config=config)
 
 
-def reconstruct_connected(
+def map_graph(
     merged: MergedGraph,
     shared: SharedIntrinsics,
     former: Sequence[SfmModel] = (),

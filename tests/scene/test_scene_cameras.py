@@ -40,7 +40,7 @@ def start_focals(directory: Path, settings: SceneConfig) -> tuple[list[float], i
     """Return the focal length that each image's camera starts with, and the number of cameras."""
     graph = ViewGraph((*IMAGES, TALL), ())
     intrinsics = given_intrinsics(graph.images, settings)
-    write_files(directory, MergedGraph(graph), intrinsics, [])
+    write_files(directory, MergedGraph(graph), intrinsics, [], settings)
     with pycolmap.Database.open(str(directory / "database.db")) as database:
         cameras = database.read_all_cameras()
         images = database.read_all_images()

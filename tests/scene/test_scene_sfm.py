@@ -27,7 +27,7 @@ from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.keypoints import MergedGraph
-from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch, reconstruct_connected
+from mkpc_kaggle.scene.sfm import Solution, map_graph, reconstruct_batch
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph
 
 
@@ -272,7 +272,7 @@ def test_an_edge_is_verified_once_for_the_same_cameras_on_any_number_of_threads(
         calls.clear()
         out = tmp_path / str(threads)
         # Both the scene and its files use all geometries.
-        reconstruct_batch(scene.pairs, config, export=out)
+        reconstruct_batch(scene.pairs, config, folder=out)
         assert len(calls) == len(scene.pairs)
         with closing(sqlite3.connect(out / "database.db")) as database:
             dump = list(database.iterdump())
@@ -282,11 +282,11 @@ def test_an_edge_is_verified_once_for_the_same_cameras_on_any_number_of_threads(
 
 def test_a_refinement_without_the_matches_of_an_image_leaves_the_image_out(scene):
     whole = MergedGraph(ViewGraph.of_pairs(scene.pairs))
-    first = reconstruct_connected(whole, {}, config=SceneConfig())
+    first = map_graph(whole, {}, config=SceneConfig())
     assert first.registered == 6
     edges = [edge for edge in whole.graph.edges if 3 not in (edge.first, edge.second)]
     lacking = MergedGraph(replace(whole.graph, edges=tuple(edges)))
-    second = reconstruct_connected(lacking, {}, first.models, config=SceneConfig())
+    second = map_graph(lacking, {}, first.models, config=SceneConfig())
     assert second.failure == ""
     names = {found.image.name for found in second.models[0].images}
     assert names == {*scene.cameras} - {"0003"}
@@ -331,7 +331,7 @@ def test_a_homography_that_was_not_estimated_is_not_read(scene, monkeypatch, tmp
 
         monkeypatch.setattr(colmap.pycolmap, "estimate_two_view_geometry", filled)
         out = tmp_path / str(number)
-        reconstruct_batch(scene.pairs, SceneConfig(), export=out)
+        reconstruct_batch(scene.pairs, SceneConfig(), folder=out)
         with closing(sqlite3.connect(out / "database.db")) as database:
             written.append([*database.iterdump()])
         files = sorted((out / "models").rglob("*.bin"))

@@ -235,7 +235,7 @@ def test_shared_intrinsics_verify_no_edge_again(tmp_path, monkeypatch):
 
     monkeypatch.setattr(pycolmap, "estimate_two_view_geometry", counted)
     scene = synthetic_scene(7, 15, points=250, focals=[FOCAL] * 7, seed=1)
-    solution = reconstruct_batch(scene.pairs, CONFIG, export=tmp_path)
+    solution = reconstruct_batch(scene.pairs, CONFIG, folder=tmp_path)
     assert len(set(focals_of(solution))) == 1
     assert len(verified) == len(scene.pairs)
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
