@@ -1,13 +1,12 @@
 """Extra pairs, which no row names: they densify the view graph of a batch with few pairs per image.
 
-- Which: :func:`extra_pairs_of` fills each batch of up to 2,000 images, with two or more pairs without known
-  intrinsics, up to ``pairs_per_image`` times as many pairs as images. This number of [scene] is 10 by default;
-  `reconstruct` sets it to 0. The image in the fewest pairs is next, with the image that shares most partners.
+- Which: :func:`extra_pairs_of` fills each batch of up to 2,000 images up to ``pairs_per_image`` times as many
+  pairs as images. This number of [scene] is 10 by default; `reconstruct` sets it to 0. The image in
+  the fewest pairs is next, with the image that shares most partners.
 - How: matched by the unit of the sweep alone, the recipe's first one of stage 1 that can run, and without an F,
   because they serve scenes alone.
 - When: with [scene], in the phase *Connect*, after the sweep and before any other unit, for up to a tenth of the
-  time that is left then (``pairs_to_connect`` of :mod:`mkpc_kaggle.engine.plan`). Pairs of the sparsest
-  batches are kept first.
+  time that is left then (:mod:`mkpc_kaggle.engine.plan`). Pairs of the sparsest batches are kept first.
 """
 
 from collections.abc import Mapping, Sequence
