@@ -1,6 +1,6 @@
 """The engine's use of time in random simulated runs.
 
-python -m benchmarks.simulation [--scenarios 1000] [--seed 0] [--pairs 10000] [--without MECHANISM]
+python -m benchmarks.simulation [--scenarios 1000] [--seed 0] [--pairs 1000] [--without MECHANISM]
 """
 
 import argparse

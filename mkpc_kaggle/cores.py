@@ -5,8 +5,8 @@
   device, unless ``--workers`` has another number.
 - A Ray actor has as many as one process alone on its machine; without GPUs, the CPUs that Ray has there.
 - A process of estimates and features has one thread, in all libraries (:func:`limit_to_one_thread`).
-- A process of a scene, or of an estimate that the others gave up, limits no library. It verifies pairs on all
-  cores. Its mapper has ``threads`` of [scene], one by default, and its last adjustment one.
+- A process of a scene limits no library. It verifies pairs on all cores. Its mapper has ``threads`` of
+  [scene], one by default, and its last adjustment one.
 - A thread of the user's process (``--workers 0``) leaves the limits of the process as they are.
 
 The number of processes is decided in :mod:`mkpc_kaggle.engine.places`.
@@ -26,7 +26,7 @@ WORKER_ENVIRONMENT = {
 
 def available_cores() -> int:
     """Return the number of cores that this process may use, by its affinity and its container's quota."""
-    import joblib  # comes with scikit-learn; here, since the import takes a while
+    import joblib  # here, since the import takes a while
 
     return int(joblib.cpu_count())
 
@@ -46,7 +46,7 @@ def limit_matching_threads(threads: int = 0, share: int = 1) -> None:
 def limit_to_one_thread() -> None:
     """Limit OpenCV, the libraries of NumPy and SciPy, and PyTorch to one thread."""
     import cv2
-    from threadpoolctl import threadpool_limits  # comes with scikit-learn
+    from threadpoolctl import threadpool_limits
 
     # For libraries that a job may load later: PyTorch, to compare features
     os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"))

@@ -2,7 +2,8 @@
 
 A cell holds the numbers of a matrix or vector row by row, separated by blanks. A test image is
 ``test_images/<batch_id>/<image_id>.png``, a train image ``<scene>/images/<image_id>.jpg``. Both
-sides accept png, jpg and jpeg. F of a pair satisfies x2^T F x1 = 0, where x1 is in the first image.
+sides accept the other suffixes of :mod:`mkpc_kaggle.data.images`, too. F of a pair satisfies
+x2^T F x1 = 0, where x1 is in the first image.
 """
 
 import csv

@@ -57,16 +57,6 @@ class RobustConfig:
         check_ranges(self, confidence=Range(0, 1, "()"))
 
 
-@dataclass(frozen=True)
-class EstimateStats:
-    """Statistics that the engine still stores: always 0, until it no longer reads them."""
-
-    support: float = 0.0
-
-
-NO_STATS = EstimateStats()
-
-
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """A model with its inliers, or the fallback with the reason."""
@@ -77,7 +67,6 @@ class Estimate:
     inliers: NDArray[np.bool_]  # (N,) mask of the given matches within the threshold
     failure: str = ""  # the reason if ``matrix`` is the fallback
     magsac: Matrix3 | None = None  # under a prior on focal lengths, MAGSAC's own F, if any
-    stats: EstimateStats = NO_STATS
 
     @property
     def ok(self) -> bool:

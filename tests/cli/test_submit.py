@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from genuine import GENUINE
-from shared import DATA, needs_data, problems_of, run_command, write_small_recipe
+from shared import DATA, needs_data, problem_of, run_command, write_small_recipe
 
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.frames import results
@@ -51,7 +51,7 @@ def test_a_submission_is_made_resumed_and_made_again_from_nothing(demo, small_re
     output, written, done = made
     assert done.returncode == 0, done.stderr
     assert "complete after" in done.stdout
-    assert problems_of(output, demo.test_dir) == []
+    assert problem_of(output, demo.test_dir) == ""
     assert submit(demo.test_dir, output, small_recipe) == 0
     assert "8 pairs from earlier runs" in capsys.readouterr().out
     assert output.read_bytes() == written
@@ -73,7 +73,7 @@ def test_a_killed_run_resumes_and_ends_with_the_bytes_of_an_undisturbed_one(
         assert running.poll() is None
     running.send_signal(signal.SIGKILL)
     running.wait()
-    assert problems_of(output, demo.test_dir) == []
+    assert problem_of(output, demo.test_dir) == ""
     assert submit(demo.test_dir, output, small_recipe) == 0
     assert output.read_bytes() == made[1]
 
@@ -83,7 +83,7 @@ def test_a_limit_that_is_over_at_the_start_leaves_a_whole_file_and_a_message(dem
     made = make(demo.test_dir, tmp_path / "submission.csv", "classical", "--time-limit", "0.1s")
     assert made.returncode == 1
     assert "the time limit passed before the first results were written" in made.stderr
-    assert problems_of(tmp_path / "submission.csv", demo.test_dir) == []
+    assert problem_of(tmp_path / "submission.csv", demo.test_dir) == ""
 
 
 # An empty file, and the rows of another competition
@@ -96,14 +96,14 @@ def test_a_whole_submission_exists_before_weights_and_devices_are_searched(
 ):
     # Weights on a slow disk, or a GPU's driver that hangs, must not cost the file.
     def look(*_, **__):
-        assert problems_of(output, demo.test_dir) == []
+        assert problem_of(output, demo.test_dir) == ""
         raise UserError("the disk with the weights cannot be read")
 
     monkeypatch.setattr("mkpc_kaggle.cli.options.assemble", look)
     output = tmp_path / "submission.csv"
     output.write_text(former)
     assert run_command("submit", "--test-dir", demo.test_dir, "--output", output) == 2
-    assert problems_of(output, demo.test_dir) == []
+    assert problem_of(output, demo.test_dir) == ""
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -129,7 +129,7 @@ def test_a_signal_ends_the_reading_of_weights(
     assert status == 128 + number  # as shells report a signal
     assert capsys.readouterr().err == "error: interrupted\n"
     if command.startswith("submit"):
-        assert problems_of(tmp_path / "submission.csv", demo.test_dir) == []
+        assert problem_of(tmp_path / "submission.csv", demo.test_dir) == ""
 
 
 @pytest.mark.genuine

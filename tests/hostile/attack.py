@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 from processes import started_with
-from shared import problems_of
+from shared import problem_of
 
 ROOT = Path(__file__).resolve().parents[2]
 # Of data, for each process; not of address space, of which CUDA builds of PyTorch reserve more.
@@ -94,11 +94,9 @@ def attack(case: Case, room: Path) -> None:
             and not was_interrupted
             and "submit" in command
             and status in ENDED_BY_ITSELF
+            and (problem := problem_of(room / "out" / "s.csv", room / "D"))
         ):
-            faults += [
-                f"submission: {problem}"
-                for problem in problems_of(room / "out" / "s.csv", room / "D")
-            ]
+            faults.append(f"submission: {problem}")
         if status in (0, 1) and "reconstruct" in command and TOO_LATE not in output:
             faults += _result_faults(room / "out" / "o", status)
     after = _snapshot(room)

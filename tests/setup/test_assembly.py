@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from safetensors.torch import save_file
-from shared import WEIGHTS, needs_weights, problems_of, run_command
+from shared import WEIGHTS, needs_weights, problem_of, run_command
 from weight_files import digest_of
 
 from mkpc_kaggle.data.competition import Pair
@@ -86,7 +86,7 @@ units = [
 
 
 def submitted(demo, tmp_path, recipe, weights):
-    """Submit with a recipe; "own" has ALIKED and SIFT. Return the exit status and the problems of
+    """Submit with a recipe; "own" has ALIKED and SIFT. Return the exit status and the problem of
     the file.
     """
     (tmp_path / "own.toml").write_text(TWO_UNITS)
@@ -101,14 +101,14 @@ def submitted(demo, tmp_path, recipe, weights):
     options = ["--output", output, "--recipe", chosen, "--weights", weights, "--workers", 0]
     options += ["--no-report", "--no-scenes"]
     status = run_command("submit", "--test-dir", test_dir, *options)
-    return status, problems_of(output, test_dir)
+    return status, problem_of(output, test_dir)
 
 
 @pytest.mark.parametrize("recipe", ["auto", "own"])
 def test_weights_of_another_network_cost_their_matcher_and_are_reported_once(
     misfits, demo, tmp_path, recipe, capsys
 ):
-    assert submitted(demo, tmp_path, recipe, misfits) == (0, [])
+    assert submitted(demo, tmp_path, recipe, misfits) == (0, "")
     told = capsys.readouterr()
     assert told.err.count("aliked is left out: the weights for 'aliked-n16'") == 1
     assert "aliked is left out: the weights for 'aliked-n16'" in told.out
