@@ -16,11 +16,7 @@ from typing import Self
 
 from mkpc_kaggle.data.competition import (
     Pair,
-<<<<<<< HEAD
     names_of,
-=======
-    read_submission,
->>>>>>> h-apply
     submission_problem,
     write_submission,
 )
@@ -117,39 +113,8 @@ class Session:
 def first_version(pairs: Sequence[Pair], output: Path, work_dir: Path) -> None:
     """Write fallback rows before using weights, devices or images, which may hang.
 
-<<<<<<< HEAD
     A complete file of an earlier run stays, and a copy of it in the work directory, since the next version is that
     of a run without its results. Raises :class:`mkpc_kaggle.errors.UserError` if ``output`` cannot be written.
-=======
-    A complete file of an earlier run is kept in the work directory, since this run begins without its results.
-    """
-    ids = [pair.id for pair in pairs]
-    former: dict[str, Matrix3] = {}
-    with suppress(UserError):  # it is missing
-        former = {} if submission_problem(output, ids) else read_submission(output)
-
-    def publish(state: State) -> None:
-        rows = dict(zip(ids, state.fundamentals, strict=True))
-        if any(_is_fallback(rows[each]) and not _is_fallback(F) for each, F in former.items()):
-            # By content: a run that begins often keeps each version once.
-            name = hashlib.blake2b(output.read_bytes(), digest_size=4).hexdigest()
-            shutil.copyfile(output, session.work_dir / f"earlier-{name}.csv")
-        former.clear()
-        write_submission(output, rows)
-
-    return run_pairs(pairs, assembly, session, root, publish=publish)
-
-
-def _is_fallback(F: Matrix3) -> bool:
-    return bool(np.allclose(F, FALLBACK_FUNDAMENTAL))
-
-
-def first_version(pairs: Sequence[Pair], output: Path) -> None:
-    """Write fallback rows, unless the file is complete, before using weights, devices or images,
-    which may hang.
-
-    Raises :class:`mkpc_kaggle.errors.UserError` if ``output`` cannot be written.
->>>>>>> h-apply
     """
     if output.is_char_device() or output.is_block_device():
         raise UserError(f"--output {output} is a device; name a file")
@@ -157,16 +122,12 @@ def first_version(pairs: Sequence[Pair], output: Path) -> None:
     with writing(f"--output {output}"):
         output.parent.mkdir(parents=True, exist_ok=True)
         TemporaryFile(dir=output.parent).close()  # before hours of work, not after them
-<<<<<<< HEAD
         if output.is_file() and not submission_problem(output, ids):
             # By content: a run that begins often keeps each version once.
             name = hashlib.blake2b(output.read_bytes(), digest_size=4).hexdigest()
             work_dir.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(output, work_dir / f"earlier-{name}.csv")
         else:
-=======
-        if not output.exists() or (output.is_file() and submission_problem(output, ids)):
->>>>>>> h-apply
             write_submission(output, dict.fromkeys(ids, FALLBACK_FUNDAMENTAL))
 
 
