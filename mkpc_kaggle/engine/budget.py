@@ -60,18 +60,15 @@ class Budget:
     started: float
     time_limit: float = inf
     clock: Callable[[], float] = time.monotonic
-    # Five, so that the median ignores two slow writes
-    _writes: deque[float] = field(default_factory=lambda: deque(maxlen=5))
-
-    def note_write(self, seconds: float) -> None:
-        self._writes.append(seconds)
+    # Seconds of the latest writes; five, so that the median ignores two slow ones
+    writes: deque[float] = field(default_factory=lambda: deque(maxlen=5))
 
     @property
     def writing(self) -> float:
         """Seconds allowed for the next write, by the median of the latest writes, which ignores a
         slow one.
         """
-        median = median_low(self._writes) if self._writes else 0.0
+        median = median_low(self.writes) if self.writes else 0.0
         return min(WRITE_MARGIN * median, MAX_WRITE_SHARE * self.time_limit)
 
     @property
@@ -111,9 +108,6 @@ class Budget:
         """Return the seconds until :attr:`stop_units`; never negative."""
         return max(0.0, self.stop_units - self.clock())
 
-    def spent(self) -> float:
-        return self.clock() - self.started
-
 
 class Costs:
     """Seconds of a unit on a pair, by name, of the estimate of a pair, and of a scene.
@@ -146,9 +140,7 @@ class Costs:
 
     def mean(self, unit: str) -> float:
         """Return the expected seconds on a pair; 0 if nothing is known."""
-        if unit in self._means:
-            return self._means[unit]
-        return self._warm_up.get(unit, 0.0)
+        return self._means.get(unit, self._warm_up.get(unit, 0.0))
 
     def forecast(self, unit: str) -> float:
         """Return the mean plus a margin that shrinks with more measurements; 0 without

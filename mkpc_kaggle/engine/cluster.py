@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from mkpc_kaggle.cores import limit_matching_threads
 from mkpc_kaggle.engine.places import Place, Site
 from mkpc_kaggle.engine.process import EXIT_TIMEOUT_S, ThreadWorker
 from mkpc_kaggle.engine.request import Answer, Cause, Failure
@@ -87,7 +88,8 @@ class RaySite(Site):
 
     def _add(self, name: str, assembly: Assembly, threads: int = 0, **where: float) -> None:
         """Add a place for workers that need these resources of Ray."""
-        runner = partial(MatchRunner, partial(Pipeline.of, assembly), threads=threads)
+        limit = partial(limit_matching_threads, threads)
+        runner = partial(MatchRunner, partial(Pipeline.of, assembly), limit)
         # Checked on the machine, since other versions or files would give other results silently.
         make = partial(make_alike, runner, __version__, self._needed)
         # Ray reserves a CPU for each actor by default, also for an actor with a GPU.

@@ -13,7 +13,7 @@ from functools import partial
 from math import inf
 from pathlib import Path
 
-from mkpc_kaggle.cores import available_cores
+from mkpc_kaggle.cores import available_cores, limit_matching_threads
 from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
 from mkpc_kaggle.engine.request import Answer, Cause, Failure, Job, Loaded
 from mkpc_kaggle.engine.worker import MatchRunner, estimates_runner, scene_runner
@@ -131,6 +131,7 @@ class Site:
         self._clock = clock
         # One queue for all workers, so the loop waits for whichever answers first.
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self.ring = partial(self._bell.put, None)
         self._worker = ThreadWorker if threads else ProcessWorker
         self._log = log
         self._cores = available_cores()
@@ -191,9 +192,6 @@ class Site:
         self.fallback = []
         self.matching_cores = self._cores  # the CPU computes now
 
-    def ring(self) -> None:
-        self._bell.put(None)
-
     def wait(self, until: float) -> None:
         """Wait until an answer or an interrupt may have arrived, at most until ``until`` on the
         engine's clock.
@@ -239,9 +237,9 @@ class LocalSite(Site):
             self.fallback = [self._place("cpu", assembly.on_cpu())]
 
     def _place(self, name: str, assembly: Assembly, share: int = 1) -> Place:
-        # A thread of the user's process leaves the process's limits as they are.
+        # The limits of the user's process stay as they are.
         is_process = self._worker is ProcessWorker
-        pipeline = partial(Pipeline.of, assembly)
-        make = partial(MatchRunner, pipeline, share=share, is_limited=is_process)
+        limit = partial(limit_matching_threads, share=share) if is_process else None
+        make = partial(MatchRunner, partial(Pipeline.of, assembly), limit)
         worker = partial(self._worker, f"mkpc {name}", make, self.ring, self._log)
         return Place(name, worker, minibatch=assembly.minibatch)

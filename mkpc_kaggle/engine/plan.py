@@ -147,8 +147,8 @@ class Plan:
             ):
                 phases[:, unit] = NEVER
             elif crop:
-                never = missing[:, :unit] & (phases[:, :unit] == NEVER)
-                phases[(never & ~state.is_crop[:unit]).any(1), unit] = NEVER
+                never = missing & (phases == NEVER) & state.before[unit]
+                phases[never.any(1), unit] = NEVER
         return phases
 
     @cached_property

@@ -40,7 +40,7 @@ class Publication:
         self.save()
         state = self._state
         about = self._about
-        about.seconds = self._budget.spent()
+        about.seconds = start - self._budget.started
         about.failures = list(state.scene_failures.values())
         # The key of each batch's scene, and the reason if it has none
         made = state.scenes
@@ -52,7 +52,7 @@ class Publication:
         about.unsaved = self._store.trouble
         # The measured time decides when the last version is written.
         self._published = self._budget.clock()
-        self._budget.note_write(self._published - start)
+        self._budget.writes.append(self._published - start)
         self._has_ended = is_last
 
     def save(self) -> str:

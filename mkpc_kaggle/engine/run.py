@@ -40,6 +40,7 @@ from mkpc_kaggle.engine.state import (
     PHASES,
     RAISED,
     REFUSED,
+    UNREADABLE,
     State,
 )
 from mkpc_kaggle.engine.store import Store, points_row
@@ -104,7 +105,7 @@ class Run:
     def run(self) -> None:
         if self.about.resumed:
             pairs = plural(self.state.rows, "pair")
-            self._say(f"{self.about.resumed} of {pairs} from earlier runs")
+            self._progress.note(f"{self.about.resumed} of {pairs} from earlier runs")
         self._publish()
         while not self.budget.is_over(self.interrupt):
             now = self.budget.clock()
@@ -147,7 +148,11 @@ class Run:
     def _take(self, place: Place, answer: Answer, now: float) -> None:
         if isinstance(answer, Loaded):
             self._has_loaded |= place.kind is Kind.MATCH
-            self._leave_out(answer)
+            for name, reason in answer.refused.items():
+                self.fault(f"{name} is left out: {reason}", logging.WARNING)
+            is_refused = [unit.matcher in answer.refused for unit in self.state.units]
+            self.state.unit_losses[is_refused] = REFUSED
+            self.state.dead |= is_refused
             return
         job, place.job = place.job, None
         if isinstance(answer, Failure):
@@ -237,8 +242,6 @@ class Run:
             self._save_scene(job, cast(Solution, answer), seconds)
         else:
             self._save_estimates(job, cast(Sequence[Estimated], answer))
-        # A full disk or a lock: the run continues, and the user may make room.
-        self.fault(self.store.trouble)
 
     def _save_points(self, job: MatchJob, answer: Sequence[PairMatch]) -> None:
         state = self.state
@@ -246,7 +249,8 @@ class Run:
         for index, outcome in zip(job.indices, answer, strict=True):
             # An unreadable image stays unreadable in this run.
             if outcome.failure:
-                state.note_unreadable(index, outcome.failure)
+                state.losses[index, :ESTIMATE] = UNREADABLE
+                state.note_reason(index, "", outcome.failure)
             for result in outcome.results:
                 unit = state.units.index(result.unit)
                 # Failures are not stored: the next run tries them again.
@@ -302,18 +306,9 @@ class Run:
         if job.candidate:
             logger.debug(text)
         else:
-            self._say(text)
+            self._progress.note(text)
         if job.folder is not None:
             self._publish()  # tables of cameras should agree with COLMAP's files
-
-    def _leave_out(self, answer: Loaded) -> None:
-        """Continue without the matchers that could not be loaded, and say so once."""
-        state = self.state
-        for name, reason in answer.refused.items():
-            self.fault(f"{name} is left out: {reason}", logging.WARNING)
-        is_refused = [unit.matcher in answer.refused for unit in state.units]
-        state.unit_losses[is_refused] = REFUSED
-        state.dead |= is_refused
 
     # Losses
 
@@ -412,10 +407,6 @@ class Run:
         if text and text not in faults and len(faults) < MAX_FAULTS:
             faults.append(text)
             logger.log(level, text)
-
-    def _say(self, text: str) -> None:
-        self._progress.note(text)
-        logger.debug(text)
 
     # The end
 

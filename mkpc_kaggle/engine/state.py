@@ -64,8 +64,8 @@ class State:
     Of a unit (U,): ``unit_losses``, lost jobs of a unit that never ran; ``dead``, no worker runs it.
 
     Of the B batches and C candidates of their scenes: ``made`` (B, C), the finished ones from today's results;
-    ``scene_losses`` (B, C); ``stale`` (B,), the scene is not today's; ``making``, (batch, candidate) under way.
-    ``batch_of`` (N,) is -1 for a pair without a batch.
+    ``scenes``, the one in use by batch, with the smallest disagreement; ``scene_losses`` (B, C); ``stale`` (B,),
+    the scene is not today's; ``making``, (batch, candidate) under way. ``batch_of`` (N,) is -1 without a batch.
     """
 
     def __init__(self, request: Request, images: Mapping[str, BatchImage]) -> None:
@@ -117,6 +117,7 @@ class State:
         self.candidates = candidates_of(self.units, scene)
         size = (len(batches), len(self.candidates))
         self.made = np.full(size, None, object)  # of SceneRecord
+        self.scenes: dict[str, SceneRecord] = {}
         self.scene_losses = np.zeros(size, np.int8)
         self.stale = np.ones(len(batches), bool)
         self.scene_failures: dict[int, str] = {}
@@ -207,18 +208,6 @@ class State:
     def fundamentals(self) -> NDArray[np.float64]:
         """The F to write (R, 3, 3) for each row of the request."""
         return self.written[1]
-
-    @property
-    def scenes(self) -> dict[str, SceneRecord]:
-        """The scene in use of each batch that has one."""
-        made = self.has_scene
-        return {name: self.scene(each) for name, each in self.batches.items() if made[each]}
-
-    def scene(self, batch: int) -> SceneRecord:
-        """Return the finished candidate with the smallest disagreement."""
-        made = {each.candidate: each for each in self.made[batch] if each is not None}
-        best: SceneRecord = made[best_of({name: made[name].disagreement for name in made})]
-        return best
 
     @property
     def scene_reasons(self) -> list[str]:
@@ -332,11 +321,9 @@ class State:
         self.needed[index, unit] = is_needed
         self.matches[index, unit] = matches if is_needed else 0
         self.losses[index, unit] = 0
-        if not self.is_crop[unit]:
-            later = self.is_crop.copy()
-            later[:unit] = False
-            self.done[index, later] = False
-            self.matches[index, later] = 0
+        later = self.before[:, unit] & self.is_crop
+        self.done[index, later] = False
+        self.matches[index, later] = 0
         self.dirty[index] = True
         if is_needed:
             self.estimated[index] = False
@@ -366,7 +353,9 @@ class State:
         elif self.stale[batch] or made[0].key != first:
             return
         made[number] = record
-        scene = self.scene(batch)
+        finished = {each.candidate: each for each in made if each is not None}
+        best = best_of({name: finished[name].disagreement for name in finished})
+        scene = self.scenes[record.batch] = finished[best]
         members = np.flatnonzero(self.batch_of == batch)
         self.dirty[members] = True
         self.scene_source[members] = FALLBACK  # of the former scene
@@ -400,10 +389,6 @@ class State:
     def note_reason(self, index: int, what: str, reason: str) -> None:
         self.reasons.setdefault(index, {})[what] = reason
         self.dirty[index] = True
-
-    def note_unreadable(self, index: int, reason: str) -> None:
-        self.losses[index, :ESTIMATE] = UNREADABLE
-        self.note_reason(index, "", reason)
 
     def has_losses(self, job: Job) -> bool:
         """Return whether a pair of a job had a lost job of the same kind."""

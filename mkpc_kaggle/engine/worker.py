@@ -64,8 +64,7 @@ def failure_of(error: Exception) -> Failure:
 
 
 class MatchRunner:
-    """A runner of match jobs with ``threads`` threads, or as one of ``share`` processes that share
-    the cores. One that is not ``is_limited`` leaves PyTorch's and OpenCV's threads as they are.
+    """A runner of match jobs. ``limit`` limits the threads of PyTorch and OpenCV.
 
     ``refused`` has the reason for each matcher that cannot be loaded: the run continues without its units. Raises
     :class:`mkpc_kaggle.errors.UserError` if none can be loaded.
@@ -74,13 +73,10 @@ class MatchRunner:
     def __init__(
         self,
         make_pipeline: Callable[[], "Pipeline"],
-        *,
-        threads: int = 0,
-        share: int = 1,
-        is_limited: bool = True,
+        limit: Callable[[], None] | None = limit_matching_threads,
     ) -> None:
-        if is_limited:
-            limit_matching_threads(threads, share)
+        if limit is not None:
+            limit()
         self._pipeline = make_pipeline()
         self._pipeline.load()
         self.refused = self._pipeline.unloadable

@@ -171,7 +171,8 @@ class Progress:
         bar.update(done - bar.n)
 
     def note(self, text: str) -> None:
-        """Print a line that stays."""
+        """Print a line that stays, and log it."""
+        logger.debug(text)
         if self._is_shown:
             self.write(f"\r{text}\n")
 

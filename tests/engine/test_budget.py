@@ -48,14 +48,14 @@ def test_a_single_slow_write_is_forgotten_and_slow_writes_are_not() -> None:
     assert budget.writing == 0
     # A disk may stall once; to reserve 200 s for each later version would waste the time.
     for seconds in (2.0, 200.0, 2.0):
-        budget.note_write(seconds)
+        budget.writes.append(seconds)
     assert budget.writing == 3.0
     # A disk that stays slow counts.
     for _ in range(3):
-        budget.note_write(40.0)
+        budget.writes.append(40.0)
     assert budget.writing == 60.0
     short = Budget(0.0, 100.0, lambda: 0.0)
-    short.note_write(90.0)
+    short.writes.append(90.0)
     assert short.writing == 5.0, "a small share of the limit at most"
     assert short.stop_units > 50
 

@@ -234,7 +234,7 @@ def noted(self, *estimate):
 def stuck(self, until):
     if len(saved) < 2:
         return wait(self, until)
-    budget.time_limit = budget.spent() + 1
+    budget.time_limit = (budget.clock() - budget.started) + 1
     time.sleep(1000)
 State.use_estimate, LocalSite.wait = noted, stuck
 home = Path(sys.argv[1])
@@ -307,7 +307,7 @@ if __name__ == "__main__":
 
 def stuck(body: str) -> subprocess.CompletedProcess[str]:
     """Run the code below a watchdog, then hang half a second before the limit."""
-    body += "; session.budget.time_limit = session.budget.spent() + 0.5; time.sleep(600)"
+    body += "; session.budget.time_limit = (time.monotonic() - session.budget.started) + 0.5; time.sleep(600)"
     return python(GUARDED.format(limit=1000.0, body=body))
 
 

@@ -40,7 +40,7 @@ def test_a_minibatch_that_would_not_end_in_time_gets_smaller_or_does_not_begin(
     matcher = NarrowMatcher(most=8)
     runner = MatchRunner(
         lambda: Pipeline(THREE_UNITS, {matcher.name: matcher}.__getitem__, minibatch=8),
-        is_limited=False,
+        limit=None,
     )
     answer = runner(job_of(pairs[:8], MatchPlan(0, [*range(8)], [0], [1e5], seconds, [])))
     assert matcher.sizes == sizes
@@ -50,7 +50,7 @@ def test_a_minibatch_that_would_not_end_in_time_gets_smaller_or_does_not_begin(
 def test_an_image_that_changed_since_the_run_read_it_fails_its_pair_alone(pairs):
     matcher = NarrowMatcher(most=8)
     runner = MatchRunner(
-        lambda: Pipeline(THREE_UNITS, {matcher.name: matcher}.__getitem__), is_limited=False
+        lambda: Pipeline(THREE_UNITS, {matcher.name: matcher}.__getitem__), limit=None
     )
     job = job_of(pairs[:2], MatchPlan(0, [0, 1], [0], [0.0], 1e6, []))
     first, second = job.pairs

@@ -214,7 +214,7 @@ def thread_place(
     """Where workers are threads of this process, with that matcher, or that pipeline."""
     make = partial(Pipeline, THREE_UNITS, {matcher.name: matcher}.__getitem__, minibatch=minibatch)
     # The threads of the tests' process stay as they are.
-    runner = partial(MatchRunner, pipeline or make, is_limited=False)
+    runner = partial(MatchRunner, pipeline or make, limit=None)
     worker = partial(ThreadWorker, name, runner, lambda: None)
     return Place(name, worker, minibatch=minibatch)
 
