@@ -3,6 +3,7 @@
 import argparse
 import json
 import re
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from math import inf
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.data.competition import Pair, TrainScene, read_train_side
-from mkpc_kaggle.engine.budget import Budget, monotonic_of
+from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.session import Session
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.progress import parse_duration
@@ -22,6 +23,7 @@ from mkpc_kaggle.signals import Interrupt
 RECIPE = """a recipe, or one matcher such as aliked_lightglue (default: auto, every matcher with its weights).
     MODE stage-1 runs its units of stage 1 alone, whole-images all its units without crops"""
 
+MAX_STEP_BACK_S = 60.0  # of the wall clock, between --started-at and the start
 WORKER_FORMS = "a number of processes, ray (this machine's cluster, or a new one for this run), ray://HOST:PORT"
 
 
@@ -162,10 +164,24 @@ def budget_of(arguments: argparse.Namespace) -> Budget:
     started = arguments.started
     if arguments.started_at is not None:
         started = monotonic_of(arguments.started_at)
-    limit = inf
-    if arguments.time_limit is not None:
-        limit = parse_duration(arguments.time_limit)
-    return Budget(started, limit)
+    limit = arguments.time_limit
+    return Budget(started, inf if limit is None else parse_duration(limit))
+
+
+def monotonic_of(epoch: float) -> float:
+    """Return the monotonic clock's time at the wall-clock time ``epoch``, given in seconds since
+    1970.
+
+    A run calls this once, at its start, so later jumps of the wall clock do not move the limit. A
+    time less than a minute ahead counts as now, because the clock was probably set back. Raises
+    :class:`UserError` for a later time.
+    """
+    ago = time.time() - epoch
+    if not -MAX_STEP_BACK_S < ago < inf:
+        raise UserError(
+            f"--started-at {epoch:g} is not a moment of the past; it is in seconds since 1970 (date +%s)"
+        )
+    return time.monotonic() - max(0.0, ago)
 
 
 @contextmanager

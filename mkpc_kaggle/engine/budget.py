@@ -15,7 +15,6 @@ from threading import Event
 from typing import Any
 
 from mkpc_kaggle.engine.request import Job, MatchJob, SceneJob
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Unit
 
 # The final report may take five times as long as writing the submission.
@@ -46,7 +45,6 @@ MAX_UNKNOWN_S = 3600.0  # without a limit, no share is finite
 # 0.2 s, and a busy machine is slower.
 UNMEASURED_ESTIMATE_S = 1.0
 START_S = 300.0  # for a worker to load its matchers, which is slow from a network disk
-MAX_STEP_BACK_S = 60.0  # of the wall clock, between --started-at and the start
 
 
 @dataclass
@@ -118,9 +116,6 @@ class Costs:
 
     def __init__(self) -> None:
         self._measured: dict[str, deque[float]] = {}
-        # Of the latest measurements, since a mean of 64 values for each plan would take longer than
-        # the plan.
-        self._means: dict[str, float] = {}
         self._warm_up: dict[str, float] = {}
         # Of this run's scenes, without their starts
         self._scene_seconds = 0.0
@@ -130,9 +125,7 @@ class Costs:
         if warm_up:
             self._warm_up[unit] = seconds
         else:
-            latest = self._measured.setdefault(unit, deque(maxlen=WINDOW))
-            latest.append(seconds)
-            self._means[unit] = fmean(latest)
+            self._measured.setdefault(unit, deque(maxlen=WINDOW)).append(seconds)
 
     def is_known(self, unit: str) -> bool:
         """Return whether a run after the warm-up was measured."""
@@ -140,7 +133,7 @@ class Costs:
 
     def mean(self, unit: str) -> float:
         """Return the expected seconds on a pair; 0 if nothing is known."""
-        return self._means.get(unit, self._warm_up.get(unit, 0.0))
+        return fmean(self._measured.get(unit, [self._warm_up.get(unit, 0.0)]))
 
     def forecast(self, unit: str) -> float:
         """Return the mean plus a margin that shrinks with more measurements; 0 without
@@ -205,19 +198,3 @@ def time_limit(job: Job, costs: Costs, budget: Budget, since: float) -> float:
         most = inf if of_pair else seconds
         seconds = min(most, HANG_FACTOR * len(job.pairs) * (of_pair or UNMEASURED_ESTIMATE_S))
     return budget.silence + seconds
-
-
-def monotonic_of(epoch: float) -> float:
-    """Return the monotonic clock's time at the wall-clock time ``epoch``, given in seconds since
-    1970.
-
-    A run calls this once, at its start, so later jumps of the wall clock do not move the limit. A
-    time less than a minute ahead counts as now, because the clock was probably set back. Raises
-    :class:`UserError` for a later time.
-    """
-    ago = time.time() - epoch
-    if not -MAX_STEP_BACK_S < ago < inf:
-        raise UserError(
-            f"--started-at {epoch:g} is not a moment of the past; it is in seconds since 1970 (date +%s)"
-        )
-    return time.monotonic() - max(0.0, ago)

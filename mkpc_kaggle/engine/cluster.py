@@ -9,7 +9,6 @@ import signal
 import socket
 import textwrap
 import threading
-import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from functools import partial
@@ -80,10 +79,8 @@ class RaySite(Site):
         workers = [place.worker for place in self.places if place.worker is not None]
         super().close()
         if self._has_joined and self._ray.is_initialized():
-            until = time.monotonic() + EXIT_TIMEOUT_S
             for worker in workers:  # killed already; the threads end soon
-                if worker.thread.is_alive():
-                    worker.thread.join(max(0.0, until - time.monotonic()))
+                worker.thread.join(EXIT_TIMEOUT_S / len(workers))
             self._ray.shutdown()
 
     def _add(self, name: str, assembly: Assembly, threads: int = 0, **where: float) -> None:
@@ -131,9 +128,7 @@ class RayWorker(ThreadWorker):
         try:
             answer: Answer = self._ray.get(self._actor.answer.remote(message))
         except self._ray.exceptions.RayError as error:
-            is_memory = isinstance(error, self._ray.exceptions.OutOfMemoryError)
-            reason = textwrap.shorten(str(error), 240)
-            return Failure(Cause.OUT_OF_MEMORY if is_memory else Cause.DIED, reason)
+            return Failure(Cause.DIED, textwrap.shorten(str(error), 240))
         return answer
 
 

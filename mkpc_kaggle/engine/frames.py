@@ -6,7 +6,7 @@ They are all that reports, the summary, notebooks and scores read.
 import json
 from base64 import b64decode
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 from mkpc_kaggle.engine.request import About, Ending
 from mkpc_kaggle.engine.store import Store, undamaged
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.critical_region import from_json
-from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Estimate
-from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import Recipe, recipe_of
 from mkpc_kaggle.scene.candidates import title_of
 from mkpc_kaggle.scene.records import CAMERAS, SceneRecord
@@ -35,7 +33,7 @@ SCENE_COLUMNS += ["candidate", "failure", "missing"]
 
 # The store unites two databases by views. So its tables are not joined: SQLite would copy one of them.
 # A former run may have had more rows.
-ROWS = "WITH rows AS (SELECT * FROM pair WHERE number < (SELECT run.rows FROM run))"
+ROWS = "WITH rows AS (SELECT *, key AS number FROM pair WHERE key < (SELECT rows FROM run))"
 PAIRS = f"""{ROWS} SELECT id AS pair, batch AS "group", image0, image1, source, choice, error, estimate, F
     FROM rows ORDER BY number"""
 ESTIMATES = f"{ROWS} SELECT key, facts FROM result WHERE key IN (SELECT estimate FROM rows)"
@@ -49,7 +47,7 @@ POINTS = f"""{ROWS} SELECT key, matches, keypoints, seconds, scale, detail, note
 IMAGES = f"""{ROWS} SELECT batch, digest, name AS image FROM (
         SELECT batch, image0 AS name, 2 * number AS position FROM rows
         UNION ALL SELECT batch, image1, 2 * number + 1 FROM rows
-    ) LEFT JOIN image USING (name) GROUP BY batch, name ORDER BY min(position)"""
+    ) LEFT JOIN image ON image.key = name GROUP BY batch, name ORDER BY min(position)"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,18 +94,13 @@ class Results:
                 used = self.units[self.units["pair"] == pair]
                 columns = "key, data, regions"
                 stored = {key: more for key, *more in store.select("points", columns, used["key"])}
-                results = []
-                crops = None
+                rows = []
                 for unit in used.to_dict("records"):
                     data, regions = stored.get(unit["key"], (None, ""))
                     # Points that the pair does not need are not used.
-                    if unit["is_needed"] and data is not None:
-                        results.append(UnitResult(units[unit["unit"]], Matches.from_bytes(data)))
-                    crops = crops or from_json(regions)
-                match = PairMatch(tuple(results), crops)
+                    rows.append((units[unit["unit"]], data if unit["is_needed"] else None, regions))
                 F = FALLBACK_FUNDAMENTAL if row["own"] is None else np.reshape(row["own"], (3, 3))
-                found = Estimate.of_nearest(F, match.matches, row["inliers"], row["failure"])
-                yield replace(match, estimate=found)
+                yield PairMatch.of_stored(rows, F, row["inliers"], row["failure"])
 
 
 def results(directory: Path | str) -> Results:
@@ -222,11 +215,11 @@ def camera_table(scenes: Iterable[SceneRecord], images: "DataFrame") -> "DataFra
 
     rows = [(scene.batch, *row) for scene in scenes for row in scene.cameras]
     frame = DataFrame(rows, columns=["batch", *CAMERAS]).drop(columns="image")
-    frame = frame.merge(images, on=["batch", "digest"]).drop(columns="digest")
+    # As in the tables of pairs, the names come first.
+    frame = images.merge(frame, on=["batch", "digest"]).drop(columns="digest")
     for name in ("K", "R", "t"):
         frame[name] = frame[name].map(np.array)
-    # As in the tables of pairs, the names come first.
-    return frame[["batch", "model", "image", *frame.columns[2:-1]]]
+    return frame
 
 
 def scene_table(
@@ -259,8 +252,3 @@ def scene_table(
         )
         table.append(row)
     return DataFrame(table, columns=SCENE_COLUMNS)
-
-
-def matrices_of(pairs: "DataFrame") -> NDArray[np.float64]:
-    """Return the written matrices (N, 3, 3) of a table of pairs."""
-    return pairs[ELEMENTS].to_numpy(float).reshape(-1, 3, 3)

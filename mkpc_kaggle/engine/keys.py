@@ -95,13 +95,10 @@ class Keys:
         stage 1.
         """
         image0, image1 = images
-        turns = map(str, pair.turns)
-        # A pair without masks has the key that it would have without the option.
+        # An image without a mask has an empty digest.
         masks = [self.masks.digest(file) for file in (pair.file0, pair.file1)]
-        masked = ["masks", *masks] if any(masks) else []
-        return text_digest(
-            [self.units[unit], image0.digest, image1.digest, *turns, *masked, *first]
-        )
+        turns = map(str, pair.turns)
+        return text_digest([self.units[unit], image0.digest, image1.digest, *turns, *masks, *first])
 
     def of_estimate(self, points: Iterable[str]) -> str:
         """Return the key of a pair's estimate from its points, in the recipe's order."""
@@ -130,7 +127,8 @@ def of_candidate(scene: str, candidate: str) -> str:
 
 def contents_of(images: Sequence[BatchImage], turns: Sequence[int]) -> str:
     """Return a text that identifies the contents of a pair's images, and their quarter turns."""
-    return " ".join([*(image.digest for image in images), *map(str, turns)])
+    image0, image1 = images
+    return " ".join(map(str, [image0.digest, image1.digest, *turns]))
 
 
 # Images
@@ -148,7 +146,7 @@ def read_images(
     Stored facts of files whose size and time have not changed are used, and new ones are stored. A run reads each
     photograph once before its first job: photographs do not change during a run.
     """
-    columns = "name, size, changed, digest, width, height, focal"
+    columns = "key, size, changed, digest, width, height, focal"
     states = {name: file_state(path) for name, path in files.items()}
     images = {name: BatchImage(name, "", Size(1, 1)) for name in files}
     for name, *state, content, width, height, focal in store.select("image", columns, files):

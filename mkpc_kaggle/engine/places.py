@@ -10,7 +10,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
-from math import inf
 from pathlib import Path
 
 from mkpc_kaggle.cores import available_cores, limit_matching_threads
@@ -54,14 +53,14 @@ class Place:
     lost: list[tuple[Job, list[int]]] = field(default_factory=list)
     closed: str = ""
     since: float = 0.0
-    restart_at: float = -inf
 
     @property
     def is_idle(self) -> bool:
         return self.worker is not None and self.is_loaded and self.job is None
 
-    def may_start(self, now: float) -> bool:
-        return self.worker is None and not self.closed and now >= self.restart_at
+    @property
+    def may_start(self) -> bool:
+        return self.worker is None and not self.closed
 
     def start(self, now: float) -> None:
         """Start a worker. Its first answer says whether it is loaded."""
@@ -154,10 +153,11 @@ class Site:
         """Return the places of a kind that are not closed."""
         return [place for place in self.places if place.kind is kind and not place.closed]
 
-    def free(self, now: float) -> list[Place]:
-        """Return the places that can take a job: those with an idle worker, then those that may start one."""
+    @property
+    def free(self) -> list[Place]:
+        """The places that can take a job: those with an idle worker, then those that may start one."""
         places = [place for place in self.places if place.is_idle]
-        return places + [place for place in self.places if place.may_start(now)]
+        return places + [place for place in self.places if place.may_start]
 
     def has_other(self, place: Place) -> bool:
         """Return whether another place can do what a place for matching does."""
@@ -165,7 +165,7 @@ class Site:
 
     @property
     def has_jobs(self) -> bool:
-        return any(place.job is not None for place in self.places)
+        return any(place.job for place in self.places)
 
     @property
     def is_closed(self) -> bool:
@@ -175,8 +175,8 @@ class Site:
     @property
     def reason(self) -> str:
         """Why places for matching are closed; empty if none is."""
-        places = [place for place in self.places if place.kind is Kind.MATCH]
-        return "; ".join(place.closed for place in places if place.closed)
+        closed = [place.closed for place in self.places if place.kind is Kind.MATCH]
+        return "; ".join(filter(None, closed))
 
     @property
     def scenes_beside(self) -> int:

@@ -16,7 +16,7 @@ each minibatch, by its own clock (:class:`mkpc_kaggle.engine.worker.MatchRunner`
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import inf, isfinite
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,11 +117,10 @@ class Plan:
         """The number of extra pairs that fit in a tenth of the time, the most useful first."""
         state = self.state
         seconds = self.costs.forecast(state.units[state.sweep].name) / max(1, self.crew.matchers)
-        if not seconds or not isfinite(self.left):
-            return len(state.pairs)
         # A share of the time after the sweep, as it was before the first extra pair
         had = int(state.done[state.rows :, state.sweep].sum())
-        return int(CONNECT_SHARE * (self.left + had * seconds) / seconds)
+        most = CONNECT_SHARE * (self.left / max(seconds, 1e-9) + had)
+        return int(min(most, len(state.pairs)))
 
     @cached_property
     def wanted(self) -> NDArray[np.int8]:
@@ -252,7 +251,8 @@ class Plan:
         if not self.left:
             # No unit begins any more, and it is too late to wait for estimates. A hung job may last until the end.
             held, later = np.zeros_like(busy), busy
-        waits = np.where(state.has_scene, state.by_batch(later), state.by_batch(held)) > 0
+        has_scene = state.made[:, 0].astype(bool)
+        waits = np.where(has_scene, state.by_batch(later), state.by_batch(held)) > 0
         is_matching = self.match is not None or bool(busy.any())
         due = state.missing_scenes & (state.scene_matches > 0) & ~waits[:, None]
         ends = self.now + self.costs.scenes(state.scene_matches)
@@ -261,7 +261,7 @@ class Plan:
         for each in state.making:
             due[each] = False
         # Each batch gets its second candidate before any gets a third.
-        batches = np.argsort(state.has_scene, kind="stable")
+        batches = np.argsort(has_scene, kind="stable")
         candidates, order = np.nonzero(due[batches].T)
         found = zip(batches[order].tolist(), candidates.tolist(), strict=True)
         most = self.crew.beside if is_matching else self.crew.scenes

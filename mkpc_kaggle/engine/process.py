@@ -118,11 +118,9 @@ class ProcessWorker(ThreadWorker):
             self._process.join(timeout=EXIT_TIMEOUT_S)
             self._pipe.close()
             code = self._process.exitcode
-            how = (
-                f"exit status {code}"
-                if code is None or code >= 0
-                else f"signal {signal.Signals(-code).name}"
-            )
+            how = f"exit status {code}"
+            if code is not None and code < 0:
+                how = f"signal {signal.Signals(-code).name}"
             return Failure(Cause.DIED, how)
         except Exception as error:  # an object that cannot be pickled
             self._process.kill()

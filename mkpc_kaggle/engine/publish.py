@@ -2,7 +2,8 @@
 
 import json
 import threading
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
+from math import inf
 
 import numpy as np
 
@@ -14,33 +15,32 @@ INTERVAL_S = 30.0  # between versions: a run that is killed loses at most this f
 TIME_SHARE = 0.05  # maximum share of the time for writing versions, if a disk is slow
 
 
+@dataclass(eq=False)
 class Publication:
     """The versions of a request's results. The loop publishes; the watchdog may save the last
     version from its own thread.
     """
 
-    def __init__(self, state: State, store: Store, budget: Budget) -> None:
-        self._state = state
-        self._store = store
-        self._budget = budget
-        self._about = state.request.about
-        self._lock = threading.Lock()
-        self._has_ended = False
-        self._published = budget.clock()
+    state: State
+    store: Store
+    budget: Budget
+    has_ended: bool = False
+    published: float = -inf
+    lock: threading.Lock = field(default_factory=threading.Lock)
 
     def is_due(self, now: float) -> bool:
-        interval = max(INTERVAL_S, self._budget.writing / TIME_SHARE)
-        return now - self._published > interval
+        interval = max(INTERVAL_S, self.budget.writing / TIME_SHARE)
+        return now - self.published > interval
 
     def publish(self, *, is_last: bool = False) -> None:
         """Write the results, and the rows of the pairs that have changed since the last version. After the last
         one, the watchdog writes no other.
         """
-        start = self._budget.clock()
+        start = self.budget.clock()
         self.save()
-        state = self._state
-        about = self._about
-        about.seconds = start - self._budget.started
+        state = self.state
+        about = self.state.request.about
+        about.seconds = start - self.budget.started
         about.failures = list(state.scene_failures.values())
         # The key of each batch's scene, and the reason if it has none
         made = state.scenes
@@ -48,29 +48,30 @@ class Publication:
         scenes = list(zip(state.batches, keys, state.scene_reasons, strict=True))
         facts = json.dumps({**asdict(about), "scenes": scenes})
         rows = self._rows()
-        self._store.put({"pair": rows, "run": [(0, len(state.pair_of_row), facts)]})
-        about.unsaved = self._store.trouble
+        self.store.put({"pair": rows, "run": [(0, len(state.pair_of_row), facts)]})
+        about.unsaved = self.store.trouble
         # The measured time decides when the last version is written.
-        self._published = self._budget.clock()
-        self._budget.writes.append(self._published - start)
-        self._has_ended = is_last
+        self.published = self.budget.clock()
+        self.budget.writes.append(self.published - start)
+        self.has_ended = is_last
 
     def save(self) -> str:
         """Write the results unless the run has ended. Return why that failed, or an empty text."""
+        about = self.state.request.about
         # The loop and the watchdog would write the same temporary file.
-        with self._lock:
-            if not self._has_ended:
+        with self.lock:
+            if not self.has_ended:
                 try:
-                    self._state.request.publish(self._state)
-                    self._about.unwritten = ""
+                    self.state.request.publish(self.state)
+                    about.unwritten = ""
                 # A full disk must not end the run; other errors are bugs and do.
                 except OSError as error:
-                    self._about.unwritten = f"the results cannot be written: {error}"
-        return self._about.unwritten
+                    about.unwritten = f"the results cannot be written: {error}"
+        return about.unwritten
 
     def _rows(self) -> list[tuple[object, ...]]:
         """Return the rows of the pairs that have changed."""
-        state = self._state
+        state = self.state
         sources, fundamentals = state.written
         scenes = state.scenes
         pending = state.lacks_estimate
@@ -102,7 +103,7 @@ class Publication:
 
     def _units(self, index: int) -> list[tuple[str, str, bool, str]]:
         """Return name, key, need and failure of each unit of a pair that has points, or a failure."""
-        state = self._state
+        state = self.state
         reasons = state.reasons.get(index, {})
         facts = (facts[index].tolist() for facts in (state.points, state.done, state.needed))
         units = []

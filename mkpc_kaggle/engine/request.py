@@ -3,14 +3,14 @@
 Messages are pickled, so none has a connection, a lock, or a large array that the worker can read itself.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.keys import Images, Keys, contents_of
+from mkpc_kaggle.engine.keys import Images, Keys
 from mkpc_kaggle.engine.store import Source
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.intrinsics import Rows
@@ -75,7 +75,7 @@ class Request:
 
     ``cameras`` are the user's known cameras. With ``scenes_dir``, a batch is reconstructed as a whole, and
     each scene has COLMAP's files in a folder there, named by its key. ``publish`` is called with the state, whose
-    ``fundamentals`` and ``scenes`` are the results so far: at the start, every half minute (less often if slow),
+    ``written`` and ``scenes`` are the results so far: at the start, every half minute (less often if slow),
     after each scene with files, and at the end.
     """
 
@@ -106,9 +106,10 @@ class PairInputs:
     estimate: str = ""
     own: Matrix3 | None = None
 
-    @property
-    def contents(self) -> str:
-        return contents_of(self.images, self.pair.turns)
+
+def keys_of(pairs: Iterable[PairInputs]) -> list[str]:
+    """Return the keys of all points of these pairs."""
+    return [key for pair in pairs for key in pair.points.values()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,15 +164,14 @@ class EstimateJob(Job):
 class SceneJob(Job):
     """Reconstruct a batch from ``matches`` matches, with COLMAP's files in ``folder``, if any.
 
-    ``scene`` are the numbers of the batch and of the candidate, which has its own ``key``; ``first`` is the key
-    of the first candidate. The answer is a :class:`Solution`, with choices in the order of the pairs.
+    ``scene`` are the numbers of the batch and of the candidate, which has its own ``key``. The answer is a
+    :class:`Solution`, with choices in the order of the pairs.
     """
 
     scene: tuple[int, int]
     batch: str
     candidate: str
     key: str
-    first: str
     matches: int = 0
     folder: Path | None = None
     cameras: Rows = ()

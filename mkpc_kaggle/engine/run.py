@@ -7,7 +7,7 @@ import json
 import logging
 import threading
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import cast
 
@@ -30,8 +30,8 @@ from mkpc_kaggle.engine.request import (
     Loaded,
     MatchJob,
     MatchPlan,
-    PairInputs,
     SceneJob,
+    keys_of,
 )
 from mkpc_kaggle.engine.state import (
     ESTIMATE,
@@ -54,35 +54,29 @@ from mkpc_kaggle.setup.console import Progress, logger
 # message and a transaction, would cost the loop more.
 MAX_ESTIMATES = 8
 MAX_LOSSES = 3  # of a place in a row, without an answer in between
-# Times the losses of a place in a row: scarce memory may become free meanwhile
-RESTART_PAUSE_S = 1.0
 MAX_FAULTS = 1000  # with different texts
 
 
+@dataclass(eq=False)
 class Run:
-    """A run from a restored state. Setting ``interrupt`` ends it early. ``about`` has its counts and faults."""
+    """A run from a restored state. Setting ``interrupt`` ends it early. ``costs`` are by this run's answers alone:
+    another machine may have computed the stored results.
+    """
 
-    def __init__(
-        self,
-        state: State,
-        site: Site,
-        store: Store,
-        budget: Budget,
-        interrupt: threading.Event,
-        progress: Progress,
-    ) -> None:
-        self.state = state
-        self.site = site
-        self.store = store
-        self.budget = budget
-        self.interrupt = interrupt
-        # By this run's answers alone: another machine may have computed the stored results.
-        self.costs = Costs()
+    state: State
+    site: Site
+    store: Store
+    budget: Budget
+    interrupt: threading.Event
+    progress: Progress
+    costs: Costs = field(default_factory=Costs)
+    has_loaded: bool = False  # some worker of matching was ready
+
+    def __post_init__(self) -> None:
+        state = self.state
         self.about = state.request.about
         self.about.resumed = int((state.done.all(1) & state.estimated)[: state.rows].sum())
-        self.publication = Publication(state, store, budget)
-        self._progress = progress
-        self._has_loaded = False  # some worker of matching was ready
+        self.publication = Publication(state, self.store, self.budget)
         # For the report: an interrupted program has two seconds for it, and the import takes one.
         import_module("pandas")
 
@@ -92,7 +86,7 @@ class Run:
             self.run()
         finally:
             self.site.close()
-            self._progress.close()
+            self.progress.close()
             self.about.ending = self.ending
             self._publish(is_last=True)
         self.about.unsaved = self.store.flush()  # the disk may have room again
@@ -103,9 +97,6 @@ class Run:
     # The loop
 
     def run(self) -> None:
-        if self.about.resumed:
-            pairs = plural(self.state.rows, "pair")
-            self._progress.note(f"{self.about.resumed} of {pairs} from earlier runs")
         self._publish()
         while not self.budget.is_over(self.interrupt):
             now = self.budget.clock()
@@ -117,14 +108,14 @@ class Run:
             if self.site.fallback and (self.site.is_closed or self.state.dead.all()):
                 self._fall_back()
             plan = self.plan(now)
-            for place in self.site.free(now):
+            for place in self.site.free:
                 self._give(place, plan)
             if not (plan.match or plan.estimates or plan.scenes or self.site.has_jobs):
                 break
             if self.publication.is_due(now):
                 self._publish()
             self.site.wait(self.budget.stop_waiting)
-        if self.site.is_closed and not self._has_loaded:
+        if self.site.is_closed and not self.has_loaded:
             raise UserError(f"no worker could be started: {self.site.reason}")
 
     def plan(self, now: float, lost: int = 0) -> Plan:
@@ -135,7 +126,7 @@ class Run:
         """The workers that exist now, without places that are closed."""
         matchers, estimators, scenes = map(self.site.of, Kind)
         # All have the same kind of device.
-        minibatch = max((place.minibatch for place in matchers), default=1)
+        minibatch = matchers[0].minibatch if matchers else 1
         beside = min(len(scenes), self.site.scenes_beside)
         return Crew(len(matchers), len(estimators), len(scenes), minibatch, beside)
 
@@ -147,7 +138,7 @@ class Run:
 
     def _take(self, place: Place, answer: Answer, now: float) -> None:
         if isinstance(answer, Loaded):
-            self._has_loaded |= place.kind is Kind.MATCH
+            self.has_loaded |= place.kind is Kind.MATCH
             for name, reason in answer.refused.items():
                 self.fault(f"{name} is left out: {reason}", logging.WARNING)
             is_refused = [unit.matcher in answer.refused for unit in self.state.units]
@@ -156,7 +147,7 @@ class Run:
             return
         job, place.job = place.job, None
         if isinstance(answer, Failure):
-            self.lose(place, job, answer, now)
+            self.lose(place, job, answer)
         elif job is not None:
             place.note_answer()
             self.save(job, answer, now - place.since)
@@ -178,7 +169,7 @@ class Run:
                 plan = self.plan(plan.now, len(place.lost))
             if plan.match is not None and place.is_idle:
                 done = self.state.done[: self.state.rows]
-                self._progress.count(PHASES[plan.phase], int(done.sum()), done.size, "unit")
+                self.progress.count(PHASES[plan.phase], int(done.sum()), done.size, "unit")
                 job = self._match_job(plan.match)
             elif plan.match is not None:
                 place.start(plan.now)  # loading takes long, and the plan may be another one then
@@ -193,7 +184,7 @@ class Run:
         state.busy[plan.pairs] = plan.phase
         upcoming = [path for index in plan.upcoming for path in state.pairs[index].images]
         # To another machine, if the worker is there
-        source = self.store.source(_keys(pairs), is_sent=True)
+        source = self.store.source(keys_of(pairs), is_sent=True)
         return MatchJob(pairs, state.request.recipe, source, plan, upcoming)
 
     def _estimate_job(self, due: list[int]) -> EstimateJob:
@@ -204,7 +195,7 @@ class Run:
         due[:] = [index for index in due if index not in chosen]
         state.estimating[chosen] = True
         pairs = tuple(map(state.inputs_of, chosen))
-        return EstimateJob(pairs, state.request.recipe, self.store.source(_keys(pairs)))
+        return EstimateJob(pairs, state.request.recipe, self.store.source(keys_of(pairs)))
 
     def _scene_job(self, batch: int, candidate: int) -> SceneJob:
         """Take a batch's candidate, from the results in use now.
@@ -220,12 +211,11 @@ class Run:
         return SceneJob(
             pairs,
             request.recipe,
-            self.store.source(_keys(pairs)),
+            self.store.source(keys_of(pairs)),
             (batch, candidate),
             list(state.batches)[batch],
             name,
             key,
-            first,
             matches=int(state.scene_matches[batch, candidate]),
             folder=None if request.scenes_dir is None else request.scenes_dir / key,
             cameras=request.cameras,
@@ -280,12 +270,12 @@ class Run:
         self.store.put({"result": rows})
         self.about.estimated += len(answer)
         # While pairs are matched, the bar shows their units.
-        if not state.is_matching:
+        if (state.busy == NEVER).all():
             done = int(state.estimated.sum())
-            self._progress.count("estimate", done, state.rows, "pair")
+            self.progress.count("estimate", done, state.rows, "pair")
 
     def _save_scene(self, job: SceneJob, answer: Solution, seconds: float) -> None:
-        contents = [pair.contents for pair in job.pairs]
+        contents = map(self.state.contents, job.indices)
         record = SceneRecord.of(
             job.batch,
             answer.reconstructions,
@@ -299,20 +289,16 @@ class Run:
         self.store.put({"result": [(job.key, record.to_json())]})
         # The time of the loop, with the process's start: the forecast needs both.
         self.costs.observe_scene(job.matches, seconds)
-        self.state.use_scene(job.scene[0], record, job.first)
-        images = f"{record.registered} of {plural(record.images, 'image')} with a camera"
-        text = f"{job}: {images}"
+        self.state.use_scene(job.scene[0], record)
         # Other candidates are lines of the log.
-        if job.candidate:
-            logger.debug(text)
-        else:
-            self._progress.note(text)
+        say = logger.debug if job.candidate else self.progress.note
+        say(f"{job}: {record.registered} of {plural(record.images, 'image')} with a camera")
         if job.folder is not None:
             self._publish()  # tables of cameras should agree with COLMAP's files
 
     # Losses
 
-    def lose(self, place: Place, job: Job | None, failure: Failure, now: float) -> None:
+    def lose(self, place: Place, job: Job | None, failure: Failure) -> None:
         """Record that a worker failed on a job, or could not start.
 
         Three rules distinguish a bad place, a bad unit and a bad pair:
@@ -334,7 +320,6 @@ class Run:
                 self._lose_scene(job, failure)
             else:
                 self._lose_pairs(place, job, failure)
-        place.restart_at = now + RESTART_PAUSE_S * place.strikes
         # A refusal is an answer of the configuration, which no other worker would change.
         if place.strikes >= MAX_LOSSES or failure.cause is Cause.REFUSED:
             self._close(place, failure)
@@ -426,7 +411,3 @@ class Run:
             return Ending.WITH_FAILURES if state.has_failures else Ending.COMPLETE
         has_estimators = bool(self.site.of(Kind.ESTIMATE))
         return Ending.TIME_IS_UP if has_estimators and not self.site.is_closed else Ending.NO_WORKER
-
-
-def _keys(pairs: Sequence[PairInputs]) -> list[str]:
-    return [key for pair in pairs for key in pair.points.values()]

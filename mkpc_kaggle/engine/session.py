@@ -142,7 +142,7 @@ def submit(
     ids = [pair.id for pair in pairs]
 
     def publish(state: State) -> None:
-        write_submission(output, dict(zip(ids, state.fundamentals, strict=True)))
+        write_submission(output, dict(zip(ids, state.written[1], strict=True)))
 
     return run_pairs(pairs, assembly, session, root, publish=publish)
 

@@ -152,10 +152,6 @@ class State:
         return np.asarray(self.losses[:, :ESTIMATE].any(1))
 
     @property
-    def is_matching(self) -> bool:
-        return bool((self.busy < NEVER).any())
-
-    @property
     def sweep(self) -> int:
         """The number of the first unit that can run, of stage 1 if possible."""
         usable = np.flatnonzero(~self.dead).tolist()
@@ -183,11 +179,6 @@ class State:
         return np.asarray((self.stale[:, None] | ~self.made.astype(bool)) & is_open)
 
     @property
-    def has_scene(self) -> Mask:
-        """(B,): a scene is in use, even if it is stale."""
-        return self.made[:, 0].astype(bool)
-
-    @property
     def written(self) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
         """For each row of the request, the source (R,) of its F, and F (R, 3, 3); the first that exists:
 
@@ -205,11 +196,6 @@ class State:
         return sources[self.pair_of_row], matrices[self.pair_of_row]
 
     @property
-    def fundamentals(self) -> NDArray[np.float64]:
-        """The F to write (R, 3, 3) for each row of the request."""
-        return self.written[1]
-
-    @property
     def scene_reasons(self) -> list[str]:
         """Why each batch (B,) has no scene, if it has none."""
         may_match = self.is_row & (self.missing | (self.matches > 0)).any(1)
@@ -221,7 +207,7 @@ class State:
         """Whether something was given up. Unreadable images and matchers that cannot be loaded are facts of the
         input.
         """
-        is_lost = (self.losses >= GIVEN_UP) & (self.losses < UNREADABLE)
+        is_lost = np.isin(self.losses, (GIVEN_UP, RAISED))
         is_dead = self.dead & (self.unit_losses < REFUSED)
         return bool(is_lost.any() or is_dead.any() or self.scene_failures)
 
@@ -268,8 +254,13 @@ class State:
         used = (self.batch_of == batch) & self.used.any(1)
         pairs = tuple(map(self.inputs_of, np.flatnonzero(used).tolist()))
         facts = [
-            [*self.names[pair.index], pair.contents, [*pair.points.values()], pair.estimate]
-            for pair in pairs
+            [
+                *self.names[each.index],
+                self.contents(each.index),
+                [*each.points.values()],
+                each.estimate,
+            ]
+            for each in pairs
         ]
         return pairs, self.request.keys.of_scene(facts)
 
@@ -277,11 +268,20 @@ class State:
 
     def restore(self, store: Store) -> None:
         """Use today's results of a store. It is the only time that it is read for the state."""
+        columns = "key, matches, scale, detail, data IS NOT NULL"
         # In the recipe's order, because the keys of crops depend on it. An extra pair has points of the sweeping
         # unit. The store may have more, of another recipe, or of a run in which it was a row, and a scene must not
         # depend on that.
-        for unit in range(len(self.units)):
-            self._restore_points(store, unit, len(self.pairs) if unit == self.sweep else self.rows)
+        for unit, crop in enumerate(self.is_crop.tolist()):
+            count = len(self.pairs) if unit == self.sweep else self.rows
+            keys = {index: self.key(index, unit) for index in range(count)}
+            stored = {key: row for key, *row in store.select("points", columns, keys.values())}
+            for index, key in keys.items():
+                matches, scale, detail, has_data = stored.get(key, (0, 0.0, 0.0, None))
+                # Under another rule than today's, the pair may have needed the unit, or not.
+                is_needed = not crop or pays(scale, detail, self.request.recipe.mkpc)
+                if has_data is not None and (has_data or not is_needed):
+                    self.use_points(index, unit, key, matches, is_needed=is_needed)
         used = np.flatnonzero(self.used[: self.rows].any(1)).tolist()
         keys = {index: self.estimate_key(index) for index in used}
         estimates = store.facts(keys.values())
@@ -291,17 +291,6 @@ class State:
         for batch in range(len(self.batches)):
             self._restore_scenes(store, batch)
 
-    def _restore_points(self, store: Store, unit: int, count: int) -> None:
-        keys = [self.key(index, unit) for index in range(count)]
-        columns = "key, matches, scale, detail, data IS NOT NULL"
-        stored = {key: row for key, *row in store.select("points", columns, keys)}
-        for index, key in enumerate(keys):
-            matches, scale, detail, has_data = stored.get(key, (0, 0.0, 0.0, None))
-            # Under another rule than today's, the pair may have needed the unit, or not.
-            is_needed = not self.is_crop[unit] or pays(scale, detail, self.request.recipe.mkpc)
-            if has_data is not None and (has_data or not is_needed):
-                self.use_points(index, unit, key, matches, is_needed=is_needed)
-
     def _restore_scenes(self, store: Store, batch: int) -> None:
         _, first = self.scene_inputs(batch)
         folder = self.request.scenes_dir
@@ -310,7 +299,7 @@ class State:
         for key in keys:
             # A scene without its folder is made again.
             if key in records and (folder is None or (folder / key).is_dir()):
-                self.use_scene(batch, SceneRecord.from_json(records[key]), first)
+                self.use_scene(batch, SceneRecord.from_json(records[key]))
 
     def use_points(
         self, index: int, unit: int, key: str, matches: int, *, is_needed: bool = True
@@ -339,8 +328,8 @@ class State:
         self.losses[index, ESTIMATE] = 0
         self._note_change(index)
 
-    def use_scene(self, batch: int, record: SceneRecord, first: str) -> None:
-        """Use a candidate of a batch, whose first one has the key ``first``.
+    def use_scene(self, batch: int, record: SceneRecord) -> None:
+        """Use a candidate of a batch.
 
         The first candidate is used even if it is stale: the former scene is older still. Further ones are
         used only if they are from the same results, and today's.
@@ -349,8 +338,8 @@ class State:
         number = self.candidates.index(record.candidate)
         if number == 0:
             made[:] = None
-            self.stale[batch] = self.scene_inputs(batch)[1] != first
-        elif self.stale[batch] or made[0].key != first:
+            self.stale[batch] = self.scene_inputs(batch)[1] != record.key
+        elif self.stale[batch] or record.key != of_candidate(made[0].key, record.candidate):
             return
         made[number] = record
         finished = {each.candidate: each for each in made if each is not None}

@@ -25,33 +25,31 @@ from mkpc_kaggle.pipeline.pair import UnitResult
 FILE_NAME = "journal.sqlite"  # named in the documentation, and in scripts of users
 LOCK_NAME = "journal.lock"
 RETRY_S = 30.0  # between tries to write rows that the file did not take
-# For a lock of another program: of a reader, and of a run, whose loop waits
-READ_TIMEOUT_S, WRITE_TIMEOUT_S = 5.0, 0.1
+TIMEOUT_S = 0.5  # for a lock of another program: the loop of a run waits, too
 # Ways to open a file. SQLite cannot create its locks in a read-only directory or on a full disk, and an immutable
 # file needs none.
 WRITE, READ, IMMUTABLE = "mode=rwc", "mode=rw", "immutable=1"
 
-# The first column of each is its key. A row of points without data is a unit that the pair does not need.
+# A row of points without data is a unit that the pair does not need.
 TABLES = {
     "points": """key TEXT PRIMARY KEY, matches INTEGER, keypoints INTEGER, seconds REAL, scale REAL,
         detail REAL, regions TEXT, note TEXT, data BLOB""",
     # Estimates, scenes and shortlists, as JSON
     "result": "key TEXT PRIMARY KEY, facts TEXT",
-    "image": """name TEXT PRIMARY KEY, size INTEGER, changed INTEGER, digest TEXT, width INTEGER, height INTEGER,
+    "image": """key TEXT PRIMARY KEY, size INTEGER, changed INTEGER, digest TEXT, width INTEGER, height INTEGER,
         focal REAL""",
     # The rows of the version that was published last. ``units`` has a list [unit, key, is needed, failure] for
     # each unit with points or a failure, as JSON.
-    "pair": """number INTEGER PRIMARY KEY, id TEXT, batch TEXT, image0 TEXT, image1 TEXT, units TEXT,
+    "pair": """key INTEGER PRIMARY KEY, id TEXT, batch TEXT, image0 TEXT, image1 TEXT, units TEXT,
         estimate TEXT, F BLOB, source TEXT, choice TEXT, error TEXT""",
-    "run": "number INTEGER PRIMARY KEY, rows INTEGER, about TEXT",
+    "run": "key INTEGER PRIMARY KEY, rows INTEGER, about TEXT",
 }
-KEYS = {table: columns.split(maxsplit=1)[0] for table, columns in TABLES.items()}
 SCHEMA = ";\n".join(f"CREATE TABLE main.{name} ({columns})" for name, columns in TABLES.items())
 SPARE = "ATTACH ':memory:' AS spare;\n"
 SPARE += SCHEMA.replace("TABLE main.", "TABLE spare.") + "".join(
     f";\nCREATE TEMP VIEW {name} AS SELECT * FROM spare.{name} UNION ALL SELECT * FROM main.{name} "
-    f"WHERE {key} NOT IN (SELECT {key} FROM spare.{name})"
-    for name, key in KEYS.items()
+    f"WHERE key NOT IN (SELECT key FROM spare.{name})"
+    for name in TABLES
 )
 # Increase it when the JSON or the bytes of a column change their meaning: nothing is converted.
 REVISION = 1
@@ -74,20 +72,21 @@ def points_row(key: str, result: UnitResult, regions: Iterable[CriticalRegion]) 
     )
 
 
+@dataclass(eq=False)
 class Store:
     """The store of a work directory. :meth:`open` gives one to write, :meth:`read` a snapshot.
 
     ``path`` is the file, or ``None`` if all is in memory. ``trouble`` is a sentence on what keeps the file
-    from having all results, if anything: some are in the database ``spare``, in memory.
+    from having all results, if anything: some are in the database ``spare``, in memory, and are written at
+    ``retry_at`` on the monotonic clock. ``lock`` is that of a store to write.
     """
 
-    def __init__(self, directory: Path, db: sqlite3.Connection, path: Path | None = None) -> None:
-        self.directory = directory
-        self.path = path
-        self.db = db
-        self.trouble = ""
-        self._lock: sqlite3.Connection | None = None
-        self._retry_at = -inf  # on the monotonic clock
+    directory: Path
+    db: sqlite3.Connection
+    path: Path | None = None
+    trouble: str = ""
+    retry_at: float = -inf
+    lock: sqlite3.Connection | None = None
 
     @classmethod
     def open(cls, directory: Path, *, fresh: bool = False) -> Self:
@@ -104,7 +103,7 @@ class Store:
                 for ending in ("", "-journal", "-wal", "-shm"):
                     directory.joinpath(FILE_NAME + ending).unlink(missing_ok=True)
             store = cls._writable(directory)
-            store._lock = lock
+            store.lock = lock
             opened.pop_all()  # the lock stays
         store.db.executescript(SPARE)
         return store
@@ -149,13 +148,13 @@ class Store:
         self.close()
 
     def close(self) -> None:
-        if self._lock is not None:
+        if self.lock is not None:
             self.flush()
             with suppress(sqlite3.Error):  # a full disk
                 # If no reader uses the file, closing leaves a single file, to copy.
                 self.db.execute("PRAGMA main.wal_checkpoint(TRUNCATE)")
-            self._lock.close()
-            self._lock = None
+            self.lock.close()
+            self.lock = None
         self.db.close()
 
     # Writing
@@ -165,13 +164,13 @@ class Store:
         again.
         """
         # Not with each answer, because waiting for a lock and writing many rows take time.
-        if monotonic() >= self._retry_at:
+        if monotonic() >= self.retry_at:
             try:
                 self._insert("main", rows)
             except sqlite3.DatabaseError as error:  # a full disk, a lock, a damaged file
                 self._note(error)
             else:
-                self._retry_at = -inf
+                self.retry_at = -inf
                 self.trouble = ""
                 return
         self._insert("spare", rows)
@@ -181,13 +180,13 @@ class Store:
         empty text.
         """
         if self.path is not None:
-            self._retry_at = -inf
+            self.retry_at = -inf
         self.put({})
         return self.trouble
 
     def _note(self, error: sqlite3.DatabaseError) -> None:
         self.trouble = f"the journal cannot be written ({error}); results stay in memory"
-        self._retry_at = inf if self.path is None else monotonic() + RETRY_S
+        self.retry_at = inf if self.path is None else monotonic() + RETRY_S
 
     def _insert(self, where: str, rows: Mapping[str, Iterable[Sequence[Any]]]) -> None:
         with self.db:
@@ -205,10 +204,9 @@ class Store:
         """Return these columns of the rows with these keys, if they exist. Raise :class:`UserError` if the file
         cannot be read.
         """
-        named = KEYS[table.removeprefix("spare.")]
         # Names of files may have letters that UTF-8 does not have.
         texts = json.dumps([printable(key) for key in keys])
-        query = f"SELECT {columns} FROM {table} WHERE {named} IN (SELECT value FROM json_each(?))"
+        query = f"SELECT {columns} FROM {table} WHERE key IN (SELECT value FROM json_each(?))"
         with undamaged(self.directory / FILE_NAME):
             return self.db.execute(query, [texts]).fetchall()
 
@@ -250,8 +248,7 @@ def connected(path: Path | str, options: str = "") -> sqlite3.Connection:
     ``path`` is a file, or ":memory:". ``options`` belong to the file's SQLite URI.
     """
     uri = f"{path.resolve().as_uri()}?{options}" if isinstance(path, Path) else f"file:{path}"
-    timeout = WRITE_TIMEOUT_S if options == WRITE else READ_TIMEOUT_S
-    return sqlite3.connect(uri, uri=True, timeout=timeout, isolation_level=None)
+    return sqlite3.connect(uri, uri=True, timeout=TIMEOUT_S, isolation_level=None)
 
 
 def checked(path: Path, options: str) -> sqlite3.Connection:

@@ -21,6 +21,7 @@ from mkpc_kaggle.engine.request import (
     MatchJob,
     PairInputs,
     SceneJob,
+    keys_of,
 )
 from mkpc_kaggle.errors import UserError, shown
 from mkpc_kaggle.matchers import failures
@@ -173,8 +174,7 @@ def compute_scene(job: Job) -> Solution:
 
 def with_points(job: Job) -> list[tuple[PairInputs, tuple[UnitResult, ...]]]:
     """Return each pair of a job with the points of its units."""
-    keys = [key for pair in job.pairs for key in pair.points.values()]
-    points = job.source.matches(keys)
+    points = job.source.matches(keys_of(job.pairs))
     return [
         (pair, tuple(UnitResult(unit, points[key]) for unit, key in pair.points.items()))
         for pair in job.pairs

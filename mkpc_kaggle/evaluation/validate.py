@@ -18,7 +18,7 @@ from mkpc_kaggle.data.competition import (
     read_rows,
     read_submission,
 )
-from mkpc_kaggle.engine.frames import Results, matrices_of
+from mkpc_kaggle.engine.frames import ELEMENTS, Results
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry import metrics
@@ -144,7 +144,7 @@ def score_pair(
     # Without a prior, the pair's F is MAGSAC's.
     matrices = {Step.MAGSAC: pair["magsac"] if Step.PRIOR in steps else own, Step.PRIOR: own}
     # The row of the submission: the scene's F, else the pair's.
-    written = matrices_of(pairs.loc[[row]])[0]
+    written = pair[ELEMENTS].to_numpy(float).reshape(3, 3)
     matrices[Step.SCENE] = None if pair["source"] == "fallback" else written
     # The last step's error is the pair's, also where a step was not made.
     errors = {step: error_of(matrix, true, scene) for step, matrix in matrices.items()}

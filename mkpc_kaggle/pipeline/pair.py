@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
-from mkpc_kaggle.geometry.critical_region import CriticalRegion
+from mkpc_kaggle.geometry.critical_region import CriticalRegion, from_json
 from mkpc_kaggle.geometry.crop_need import CropNeed
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
@@ -111,6 +111,22 @@ class PairMatch:
         from mkpc_kaggle.pipeline.drawing import draw_pair  # it draws this class
 
         return draw_pair((as_image(image0), as_image(image1)), self)
+
+    @classmethod
+    def of_stored(
+        cls, stored: Iterable[tuple[Unit, bytes | None, str]], F: Matrix3, count: int, failure: str
+    ) -> "PairMatch":
+        """Return a pair from the matches of its units, as bytes, if any, and its regions, as text. The inliers
+        of F are the ``count`` matches that are nearest to it.
+        """
+        results = []
+        regions = None
+        for unit, data, text in stored:
+            if data is not None:
+                results.append(UnitResult(unit, Matches.from_bytes(data)))
+            regions = regions or from_json(text)
+        match = cls(tuple(results), regions)
+        return replace(match, estimate=Estimate.of_nearest(F, match.matches, count, failure))
 
     def facts(self, keys: Iterable[str]) -> dict[str, object]:
         """Return the estimate as JSON values, under the names that they have in a store.

@@ -4,13 +4,13 @@ import time
 import numpy as np
 import pytest
 
+from mkpc_kaggle.cli.options import monotonic_of
 from mkpc_kaggle.engine.budget import (
     SCENE_MARGIN,
     SCENE_START_S,
     WINDOW,
     Budget,
     Costs,
-    monotonic_of,
 )
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.progress import parse_duration

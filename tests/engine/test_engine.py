@@ -64,7 +64,7 @@ def test_every_published_version_is_complete_and_the_first_comes_before_any_work
     published = []
 
     def publish(state: State) -> None:
-        published.append((state.fundamentals, len(matcher.calls)))
+        published.append((state.written[1], len(matcher.calls)))
 
     run(write_pairs(tmp_path, 5), THREE_UNITS, matcher, tmp_path / "work", publish=publish)
     assert published[0][1] == 0

@@ -18,13 +18,14 @@ import pytest
 from faulty import FaultyMatcher, die, exhaust_memory
 from processes import started_with
 from rectified import THREE_UNITS, RectifiedMatcher, matrices, run, write_pairs
+from run_tables import matrices_of
 from shared import write_small_recipe
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_test_side, submission_problem
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine import keys, session, worker
-from mkpc_kaggle.engine.frames import matrices_of, results, results_of
+from mkpc_kaggle.engine.frames import results, results_of
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.run import Run
 from mkpc_kaggle.engine.store import Store
@@ -106,7 +107,7 @@ def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(
     monkeypatch.setattr(Run, "_save_points", fail_later)
     with pytest.raises(KeyError, match="a bug"):
         run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=published.append)
-    assert len(published[-1].fundamentals) == 12
+    assert len(published[-1].written[1]) == 12
     with Store.read(tmp_path / "work") as store:
         has_units = results_of(store).pairs["units"] > 0
     assert has_units.tolist() == [True, True] + [False] * 10
@@ -240,7 +241,7 @@ State.use_estimate, LocalSite.wait = noted, stuck
 home = Path(sys.argv[1])
 pairs = write_pairs(home / "pairs", 40)
 def publish(state):
-    (home / "out").write_text(str(len(set(map(bytes, state.fundamentals)))))
+    (home / "out").write_text(str(len(set(map(bytes, state.written[1])))))
 run(pairs, THREE_UNITS, RectifiedMatcher(), home / "work", budget=budget, publish=publish, is_watched=True)
 """
 

@@ -36,8 +36,8 @@ def test_tables_without_rows_have_their_columns(work):
     assert len(tables.cameras) == 0
     assert list(tables.cameras.columns[:6]) == [
         "batch",
-        "model",
         "image",
+        "model",
         "width",
         "height",
         "focal",

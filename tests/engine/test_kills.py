@@ -9,10 +9,11 @@ from typing import Any
 
 import pytest
 from rectified import matrices, run, sources
+from run_tables import matrices_of
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.engine import process
-from mkpc_kaggle.engine.frames import Results, matrices_of
+from mkpc_kaggle.engine.frames import Results
 from mkpc_kaggle.engine.request import Ending
 
 

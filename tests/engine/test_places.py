@@ -79,7 +79,7 @@ def test_the_workers_of_a_machine_share_its_cores_on_gpus_too(
 ):
     made = SimpleNamespace(pipeline=None, minibatch=1)
     assembly = SimpleNamespace(devices=devices, on=lambda *_: made, on_cpu=lambda: made)
-    worker = lambda name, make, *_: SimpleNamespace(share=make.keywords["share"])  # noqa: E731
+    worker = lambda name, make, *_: SimpleNamespace(share=make.args[1].keywords["share"])  # noqa: E731
     monkeypatch.setattr(places, "ProcessWorker", worker)
     site = LocalSite(assembly, workers, lambda: 0.0)
     assert [place.make().share for place in site.of(Kind.MATCH)] == shares

@@ -35,7 +35,7 @@ IMAGES = (
 POINTS = np.random.default_rng(1).uniform(0, 70, (50_000, 2)).astype(np.float32)
 MATCHES = Matches(POINTS, POINTS, POINTS[:, 0])
 SCENES = Recipe((Unit(1, "m", 80),), scene=SceneConfig())
-LARGE = SceneJob((BatchPair(*IMAGES, (MATCHES,)),), SCENES, Source(), (0, 0), "one", "", "k", "k")
+LARGE = SceneJob((BatchPair(*IMAGES, (MATCHES,)),), SCENES, Source(), (0, 0), "one", "", "k")
 
 
 class Worker(ProcessWorker):

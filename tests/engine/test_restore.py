@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rectified import SECOND, SWEEP, THIRD
+from run_tables import matrices_of
 from store_room import CAMERA, RECIPE, REGIONS, F, Room, matches_of, pair_of
 
 from mkpc_kaggle.engine.frames import (
     NOT_REACHED,
-    matrices_of,
     results_of,
 )
 from mkpc_kaggle.engine.store import Store

@@ -20,11 +20,12 @@ from faulty import (
     scenes_by,
 )
 from rectified import SIZE, THREE_UNITS, RectifiedMatcher, batch_pairs, matrices, run, sources
+from run_tables import matrices_of
 from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.frames import matrices_of, results
+from mkpc_kaggle.engine.frames import results
 from mkpc_kaggle.engine.request import Ending, SceneJob
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
@@ -45,7 +46,7 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first, process=True)
     pairs = batch_pairs(tmp_path / "images")
     published = []
-    publish = lambda state: published.append(state.fundamentals)  # noqa: E731
+    publish = lambda state: published.append(state.written[1])  # noqa: E731
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", publish=publish)
     assert report.ending is Ending.COMPLETE
     assert sources(report) == ["pair"] + ["scene"] * 5

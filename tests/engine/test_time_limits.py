@@ -20,7 +20,7 @@ def matching(pairs: int) -> MatchJob:
 
 
 def scene(matches: int) -> SceneJob:
-    return SceneJob((), SOME, SOME, (0, 0), "batch", "", "key", "key", matches)
+    return SceneJob((), SOME, SOME, (0, 0), "batch", "", "key", matches)
 
 
 def estimates(pairs: int) -> EstimateJob:

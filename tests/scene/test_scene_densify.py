@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pandas.testing import assert_frame_equal
 from rectified import run, sources
+from run_tables import matrices_of
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
-from mkpc_kaggle.engine.frames import matrices_of, results
+from mkpc_kaggle.engine.frames import results
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.recipe import SceneConfig
@@ -63,7 +64,7 @@ def test_a_sparse_batch_has_a_scene_by_pairs_that_no_row_names(tmp_path):
     published: list[int] = []
 
     def publish(standing: State) -> None:
-        published.append(len(standing.fundamentals))
+        published.append(len(standing.written[1]))
 
     report = run(asked, recipe, matcher, work, publish=publish)
     assert report.ending is Ending.COMPLETE

@@ -9,7 +9,7 @@ from typing import Any
 
 from store_room import memory_store
 
-from mkpc_kaggle.engine.frames import Results, results_of
+from mkpc_kaggle.engine.frames import ELEMENTS, Results, results_of
 from mkpc_kaggle.engine.request import About
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.scene.records import SceneRecord
@@ -82,3 +82,8 @@ def tables_of(
         about["scenes"] = [(each.batch, each.key, each.failure) for each in scenes]
         store.put({"run": [(0, len(described), json.dumps(about))]})
         return results_of(store)
+
+
+def matrices_of(pairs: Any) -> Any:
+    """The written matrices (N, 3, 3) of a table of pairs."""
+    return pairs[ELEMENTS].to_numpy(float).reshape(-1, 3, 3)

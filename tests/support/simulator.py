@@ -301,15 +301,14 @@ class SimulatedSite(Site):
 
     def wait(self, until: float) -> None:
         now = self.clock.now
-        pauses = [place.restart_at for place in self.places if place.restart_at > now]
-        moment = min([until, *pauses, *(worker.ready for worker in self.workers)])
+        moment = min([until, *(worker.ready for worker in self.workers)])
         # Hung jobs end by their own limits.
         assert moment < math.inf or self.has_jobs, "the engine waits for ever"
         moment = min(moment, self.clock.now + WAKE_S)
         if any(place.job for place in self.of(Kind.SCENE)):
             # After a loss, a place gets another worker only when there is work for it.
             now = self.clock.now
-            idle = sum(place.is_idle or place.may_start(now) for place in self.of(Kind.MATCH))
+            idle = sum(place.is_idle or place.may_start for place in self.of(Kind.MATCH))
             self.for_scenes += idle * max(0.0, min(moment, self.stop) - now)
         self.clock.now = max(self.clock.now, moment)
 
@@ -531,7 +530,7 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
     if store is None:
         store = memory_store()
         weakref.finalize(store, store.db.close)  # since 3.13, Python warns of open connections
-    publish = lambda state: published.append(len(state.fundamentals))  # noqa: E731
+    publish = lambda state: published.append(len(state.written[1]))  # noqa: E731
     about = About({"scene": {}} if scenario.batches else {})
     request = Request(pairs, scenario.recipe, scenario.keys, about=about, publish=publish)
     state = State(request, {name: BatchImage(name, name, SIZE) for name in names})
@@ -554,7 +553,7 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
     lacks_units[bad] = False
     closed = [place for place in site.matching if place.closed]
     # A place that is closed has no time to use.
-    site.faults += sum(max(0.0, site.stop - place.restart_at) for place in closed)
+    site.faults += sum(max(0.0, site.stop - place.since) for place in closed)
     sweep_fits = sweep_seconds(scenario) < SWEEP_SHARE * scenario.limit
     given = scenario.workers * (site.stop - RESTART_S) - site.faults
     faulty = {scene.batch for scene in site.scenes if scene.is_faulty}

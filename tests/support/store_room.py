@@ -151,7 +151,7 @@ class Room:
         ]
         answer = Solution((Reconstruction(("0.png", "1.png"), (model,)),), tuple(choices))
         recipe = state.request.recipe
-        job = SceneJob(pairs, recipe, Source(), (0, 0), "one", "", key, key, 60)
+        job = SceneJob(pairs, recipe, Source(), (0, 0), "one", "", key, 60)
         self.run.save(job, answer, 1.5)
 
     def publish(self) -> None:
