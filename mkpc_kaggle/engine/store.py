@@ -18,7 +18,7 @@ from time import monotonic
 from typing import Any, Self
 
 from mkpc_kaggle.errors import UserError, printable, writing
-from mkpc_kaggle.geometry.critical_region import CriticalRegion, to_json
+from mkpc_kaggle.geometry.critical_region import CriticalRegion, regions_json
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 
@@ -66,7 +66,7 @@ def points_row(key: str, result: UnitResult, regions: Iterable[CriticalRegion]) 
         result.seconds,
         None if need is None else need.scale,
         None if need is None else need.detail,
-        to_json(regions) if result.unit.stage == 2 else "",
+        regions_json(regions) if result.unit.stage == 2 else "",
         result.note,
         result.matches.to_bytes() if result.is_needed else None,
     )

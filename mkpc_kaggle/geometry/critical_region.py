@@ -109,8 +109,8 @@ class CriticalRegion:
     reason: RegionReason
 
 
-def to_json(regions: Iterable[CriticalRegion]) -> str:
-    """Return regions as text, which :func:`from_json` reads."""
+def regions_json(regions: Iterable[CriticalRegion]) -> str:
+    """Return regions as text, which :func:`regions_of` reads."""
     rows = []
     for region in regions:
         box = region.box
@@ -118,7 +118,7 @@ def to_json(regions: Iterable[CriticalRegion]) -> str:
     return json.dumps(rows)
 
 
-def from_json(text: str) -> tuple[CriticalRegion, CriticalRegion] | None:
+def regions_of(text: str) -> tuple[CriticalRegion, CriticalRegion] | None:
     if not text:
         return None
     first, second = (

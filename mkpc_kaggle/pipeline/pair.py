@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
-from mkpc_kaggle.geometry.critical_region import CriticalRegion, from_json
+from mkpc_kaggle.geometry.critical_region import CriticalRegion, regions_of
 from mkpc_kaggle.geometry.crop_need import CropNeed
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
@@ -124,7 +124,7 @@ class PairMatch:
         for unit, data, text in stored:
             if data is not None:
                 results.append(UnitResult(unit, Matches.from_bytes(data)))
-            regions = regions or from_json(text)
+            regions = regions or regions_of(text)
         match = cls(tuple(results), regions)
         return replace(match, estimate=Estimate.of_nearest(F, match.matches, count, failure))
 

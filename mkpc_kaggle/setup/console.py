@@ -140,12 +140,18 @@ class Progress:
         self._left = left  # seconds of the run
         self._is_shown = is_shown
         self._bar: Any = None
+        self._phase = ""  # that was logged last
         # A notebook's `!command` has a terminal, but Jupyter keeps every state of a line. It sets
         # JPY_PARENT_PID for these processes.
         self._is_redrawn = is_terminal(sys.stderr) and "JPY_PARENT_PID" not in os.environ
 
     def count(self, phase: str, done: int, total: int, unit: str) -> None:
-        """Show the units that are done in a phase. Other units, or fewer than before, have a line of their own."""
+        """Show the units that are done in a phase. Other units, or fewer than before, have a line of
+        their own. A change of phase is a line of the log.
+        """
+        if phase != self._phase:
+            self._phase = phase
+            logger.debug(phase)
         if not self._is_shown or not total:
             return
         bar = self._bar

@@ -23,6 +23,7 @@ from shared import write_small_recipe
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_test_side, submission_problem
+from mkpc_kaggle.data.images import Unreadable
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine import keys, session, worker
 from mkpc_kaggle.engine.frames import results, results_of
@@ -41,7 +42,7 @@ def test_worker_processes_give_the_bytes_of_a_run_in_this_process_and_estimate_f
     pairs, undisturbed, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(
-        worker, "estimate_pair", lambda *_: pytest.fail("F is estimated in the parent")
+        worker, "with_estimate", lambda *_: pytest.fail("F is estimated in the parent")
     )
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", workers=2)
     assert report.ending is Ending.COMPLETE
@@ -72,15 +73,15 @@ def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(tmp_path, monkey
     released = threading.Event()
     digested = []
 
-    def digest(path: Path) -> str:
+    def digest(path: Path) -> Unreadable:
         for signal_number in first:
             os.kill(os.getpid(), signal_number)
             # As long as the digest of an image of many GB takes
             released.wait(60)
             digested.append(path)
-        return "changed"
+        return Unreadable(str(path), "changed")
 
-    monkeypatch.setattr(keys, "content_digest", digest)
+    monkeypatch.setattr(keys, "image_facts", digest)
     # Copied or restored files have other times: whether they changed, only a digest can tell.
     for path in (tmp_path / "images").iterdir():
         os.utime(path, (0, 0))

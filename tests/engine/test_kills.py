@@ -26,7 +26,6 @@ def test_a_run_whose_workers_are_killed_at_random_moments_ends_as_the_undisturbe
     tmp_path, monkeypatch, rounds
 ):
     pairs = synthetic_pairs(tmp_path / "images")
-    monkeypatch.setattr("mkpc_kaggle.engine.run.RESTART_PAUSE_S", 0.0)
 
     def run_whole(name: str) -> Results:
         report = run(pairs, RECIPE, SyntheticMatcher(), tmp_path / name, workers=2)

@@ -88,7 +88,7 @@ def test_a_focal_length_of_exif_goes_to_the_pairs_the_store_and_the_scene(tmp_pa
     for name, expected in cases:
         reports.append(run(pairs, recipe, RectifiedMatcher(), tmp_path / name))
         with Store.read(tmp_path / name) as store:
-            known = dict(store.db.execute("SELECT name, focal FROM image"))
+            known = dict(store.db.execute("SELECT key, focal FROM image"))
         assert [(known[pair.file0], known[pair.file1]) for pair in pairs] == expected
         set_exif(pairs[0].images[0], tA405=28)
     without, with_exif = (each.pairs["own"] for each in reports)

@@ -17,7 +17,6 @@ import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, Seen
 
 from mkpc_kaggle.engine import places, session
-from mkpc_kaggle.engine import run as engine_run
 from mkpc_kaggle.engine.places import Kind, LocalSite, Place
 from mkpc_kaggle.engine.process import ThreadWorker
 from mkpc_kaggle.engine.request import SceneJob
@@ -234,7 +233,6 @@ def use_places(
 
     monkeypatch.setattr(session, "LocalSite", site_of)
     monkeypatch.setattr(places, "LISTEN_S", 0.01)
-    monkeypatch.setattr(engine_run, "RESTART_PAUSE_S", 0.0)
 
 
 def on_fork(monkeypatch: pytest.MonkeyPatch, act: Callable[[int], None]) -> None:

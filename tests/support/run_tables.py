@@ -7,7 +7,7 @@ from dataclasses import asdict
 from types import MappingProxyType
 from typing import Any
 
-from store_room import memory_store
+from simulator import facts_of, memory_store
 
 from mkpc_kaggle.engine.frames import ELEMENTS, Results, results_of
 from mkpc_kaggle.engine.request import About
@@ -49,7 +49,7 @@ class Described:
         """The rows of the store, with a key for each pair."""
         key = f"points {number}" if self.matches else ""
         F = FALLBACK_FUNDAMENTAL
-        facts = {"F": F.ravel().tolist(), "failure": self.failure, "inliers": {key: self.inliers}}
+        facts = facts_of({key: self.inliers}) | {"failure": self.failure}
         estimate = "" if self.failure is None else f"estimate {number}"
         points = (key, self.matches, 0, self.seconds, None, None, "", "", b"")
         has_run = bool(key or self.error)

@@ -11,10 +11,10 @@ import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from store_room import facts_of, memory_store
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine import budget, plan
@@ -38,7 +38,7 @@ from mkpc_kaggle.engine.request import (
 )
 from mkpc_kaggle.engine.run import Run
 from mkpc_kaggle.engine.state import GIVEN_UP, State
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.store import SPARE, Store, connected, create
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.crop_need import CropNeed
 from mkpc_kaggle.geometry.matches import Matches
@@ -479,6 +479,22 @@ class SimulatedWorker:
         if self._start_s and (is_stalled or isinstance(self._answer, Failure)):
             lost = min(self._fault, site.clock.now - self._begun)
             site.faults += max(0.0, min(lost, site.stop - self._begun))
+
+
+def memory_store(directory: Path = Path()) -> Store:
+    """A store that leaves no file."""
+    store = Store(directory, connected(":memory:"))
+    create(store.db)
+    store.db.executescript(SPARE)
+    return store
+
+
+def facts_of(
+    inliers: dict[str, int], F: Any = FALLBACK_FUNDAMENTAL, magsac: Any = None
+) -> dict[str, object]:
+    """The facts of an estimate."""
+    magsac = None if magsac is None else magsac.ravel().tolist()
+    return {"F": F.ravel().tolist(), "failure": "", "magsac": magsac, "inliers": inliers}
 
 
 @dataclass(frozen=True)

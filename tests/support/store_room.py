@@ -2,11 +2,10 @@
 
 import threading
 from collections.abc import Iterable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rectified import SECOND, SWEEP, THREE_UNITS
+from simulator import facts_of
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
@@ -24,13 +23,12 @@ from mkpc_kaggle.engine.request import (
 from mkpc_kaggle.engine.run import Run
 from mkpc_kaggle.engine.state import SWEEP as SWEEPING
 from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.engine.store import SPARE, Source, Store, connected, create
+from mkpc_kaggle.engine.store import Source, Store
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.crop_need import CropNeed
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
@@ -76,22 +74,6 @@ def state_of(
     }
     about = About({**recipe.table(), "name": "x"})
     return State(Request(pairs, recipe, keys_of(recipe, **other), about=about), images)
-
-
-def memory_store(directory: Path = Path()) -> Store:
-    """A store that leaves no file."""
-    store = Store(directory, connected(":memory:"))
-    create(store.db)
-    store.db.executescript(SPARE)
-    return store
-
-
-def facts_of(
-    inliers: dict[str, int], F: Any = FALLBACK_FUNDAMENTAL, magsac: Any = None
-) -> dict[str, object]:
-    """The facts of an estimate."""
-    magsac = None if magsac is None else magsac.ravel().tolist()
-    return {"F": F.ravel().tolist(), "failure": "", "magsac": magsac, "inliers": inliers}
 
 
 class Room:
