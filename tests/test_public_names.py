@@ -26,10 +26,17 @@ DOCUMENTED = [
 ]
 
 
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """The folder of all examples: that of ``results`` continues the run of ``reconstruct``."""
+    directory = tmp_path_factory.mktemp("examples")
+    write_two_views(directory)
+    return directory
+
+
 @pytest.mark.parametrize("name", DOCUMENTED)
-def test_the_examples_of_a_public_name_run(name, tmp_path, monkeypatch):
-    write_two_views(tmp_path)
-    monkeypatch.chdir(tmp_path)
+def test_the_examples_of_a_public_name_run(name, home, monkeypatch):
+    monkeypatch.chdir(home)
     public = getattr(mkpc_kaggle, name)
     (examples,) = doctest.DocTestFinder(recurse=False).find(public, name, globs={})
     assert examples.examples

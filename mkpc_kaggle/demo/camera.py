@@ -1,7 +1,10 @@
-"""Pinhole cameras with image sizes: projection of world points, and covisibility of two views.
+"""Pinhole cameras with image sizes, and covisibility of two views.
 
 Pixel centres are at integer coordinates: (0, 0) is the centre of the top-left pixel, x to the
 right, y down. The world has z up; a camera looks along its +z. `X_cam = R X + t`.
+
+Nearness is the inverse of the depth along the camera's axis, in 1 / metres. It is 0 for the sky,
+and on a plane it is linear in the pixel.
 """
 
 from dataclasses import dataclass, replace
@@ -10,12 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 
 Floats = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 
-DEPTH_TOLERANCE = 0.01  # relative; on a plane, interpolating inverse depth is exact
+TOLERANCE = 0.01  # relative, of nearness
 STEP_PX = 3  # covisibility needs only every third pixel of every third row
 
 
@@ -57,75 +60,54 @@ def resized_camera(camera: SizedCamera, scale: float) -> SizedCamera:
     Sides are rounded to whole pixels, but K has the exact scale. So the image loses or gains up to
     half a pixel on the right and at the bottom.
     """
-    offset = (scale - 1) / 2  # (x + 0.5) s - 0.5 = s x + (s - 1) / 2
-    to_resized = np.array([[scale, 0, offset], [0, scale, offset], [0, 0, 1]])
+    K = camera.K.copy()
+    K[:2] *= scale
+    K[:2, 2] += (scale - 1) / 2  # (x + 0.5) s - 0.5 = s x + (s - 1) / 2
     width = max(1, round(camera.width * scale))
     height = max(1, round(camera.height * scale))
-    return replace(camera, K=to_resized @ camera.K, width=width, height=height)
+    return replace(camera, K=K, width=width, height=height)
 
 
-def project(camera: SizedCamera, points: Floats) -> tuple[Floats, Floats]:
-    """Project world points (N, 3) to pixels (N, 2) and depths (N,).
+def transfer(
+    first: SizedCamera, nearness: FloatImage, second: SizedCamera
+) -> tuple[Floats, Floats]:
+    """Return where `second` would show the points of `first`, if nothing were in front of them.
 
-    Pixels of depth <= 0 are undefined.
+    `nearness` (H, W) belongs to `first`. The results are pixels (h, w, 2) in `second` and their
+    nearness (h, w) there, for every third pixel of every third row. Behind `second` it is negative.
     """
-    in_camera = points @ camera.R.T + camera.t
-    image = in_camera @ camera.K.T
-    depth = image[:, 2]
-    # No division by zero: NumPy would warn, and callers ignore these pixels.
-    divisor = np.where(depth == 0, np.finfo(np.float64).tiny, depth)
-    return image[:, :2] / divisor[:, None], depth
-
-
-def unproject(camera: SizedCamera, pixels: Floats, depth: Floats) -> Floats:
-    """Convert pixels (N, 2), with depths (N,) along the camera's axis, to world points (N, 3)."""
-    homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
-    rays = homogeneous @ np.linalg.inv(camera.K).T  # of depth 1
-    in_camera = rays * depth[:, None]
-    # R is orthogonal, so the product with R instead of R^T undoes the rotation of rows.
-    return np.asarray((in_camera - camera.t) @ camera.R, dtype=np.float64)
+    R, t = relative_pose(first, second)
+    y, x = np.mgrid[0 : first.height : STEP_PX, 0 : first.width : STEP_PX]
+    near = nearness[::STEP_PX, ::STEP_PX].astype(np.float64)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(first.K).T
+    # The point's coordinates times its nearness: a direction for the sky.
+    in_second = rays @ R.T + near[..., None] * t
+    image = in_second @ second.K.T
+    scale = image[..., 2]
+    return image[..., :2] / scale[..., None], near / scale
 
 
 def visible_mask(
-    first: SizedCamera,
-    first_depth: FloatImage,
-    second: SizedCamera,
-    second_depth: FloatImage,
-    step: int = 1,
+    first: SizedCamera, first_nearness: FloatImage, second: SizedCamera, second_nearness: FloatImage
 ) -> NDArray[np.bool_]:
-    """Return where `second` shows the same points, a bool mask of every `step`-th pixel of `first`.
+    """Return where `second` shows the same points, for the pixels of `transfer`: bool (h, w).
 
-    Depths are (H, W) float32 in metres, and inf for the sky, which is never shared. A point is not
-    visible outside the second image, behind the second camera, or behind a nearer surface.
+    The sky is never shared. A point is not visible outside the second image, behind the second
+    camera, or behind a nearer surface.
     """
-    y, x = np.mgrid[0 : first.height : step, 0 : first.width : step]
-    depth = first_depth[::step, ::step].astype(np.float64)
-    is_surface = np.isfinite(depth)
-    # Any finite depth will do for the sky, which is_surface excludes.
-    finite_depth = np.where(is_surface, depth, 1.0).ravel()
-    sampled = np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
-    pixels, expected = project(second, unproject(first, sampled, finite_depth))
-
-    last_pixel = (second.width - 1, second.height - 1)
-    inside = ((pixels >= 0) & (pixels <= last_pixel)).all(axis=1)
-    inside &= expected > 0
-
-    # On a plane, 1 / depth is linear in the pixel, so bilinear interpolation is exact.
-    # Any pixel will do for points outside, which ``inside`` excludes.
-    read = np.where(inside[:, None], pixels, 0)
-    maps = read.astype(np.float32).reshape(*x.shape, 2)
-    nearness = 1 / second_depth
-    found = cv2.remap(nearness, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
-    agrees = np.abs(found * expected.reshape(x.shape) - 1) < DEPTH_TOLERANCE
-    return np.asarray(is_surface & inside.reshape(x.shape) & agrees, dtype=np.bool_)
+    pixels, expected = transfer(first, first_nearness, second)
+    x, y = np.moveaxis(pixels.astype(np.float32), -1, 0)
+    # Outside the image OpenCV returns 0, the nearness of the sky, which agrees with no point.
+    found = cv2.remap(second_nearness, x, y, cv2.INTER_LINEAR)
+    return np.asarray(np.abs(found - expected) < TOLERANCE * expected)
 
 
 def covisibility(
-    first: SizedCamera, first_depth: FloatImage, second: SizedCamera, second_depth: FloatImage
+    first: SizedCamera, first_nearness: FloatImage, second: SizedCamera, second_nearness: FloatImage
 ) -> float:
     """Return the smaller fraction of one view visible in the other, in [0, 1], in any order."""
-    shared_by_first = visible_mask(first, first_depth, second, second_depth, STEP_PX)
-    shared_by_second = visible_mask(second, second_depth, first, first_depth, STEP_PX)
+    shared_by_first = visible_mask(first, first_nearness, second, second_nearness)
+    shared_by_second = visible_mask(second, second_nearness, first, first_nearness)
     return min(float(shared_by_first.mean()), float(shared_by_second.mean()))
 
 

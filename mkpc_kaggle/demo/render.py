@@ -5,13 +5,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from mkpc_kaggle.demo.camera import FloatImage, Floats, SizedCamera, project, resized_camera
+from mkpc_kaggle.demo.camera import FloatImage, Floats, SizedCamera, resized_camera
 from mkpc_kaggle.geometry.coordinates import Pixels
 
 RAYS = 3  # along each axis of a pixel; odd, so that one ray passes through the pixel's centre
-SUN = np.array([0.41, -0.51, 0.76])  # the direction towards the light
+SUN = (0.41, -0.51, 0.76)  # the direction towards the light
 # Shares of the light: 0.72 in the shade, up to 1.1 towards the sun.
 AMBIENT = 0.72
 DIFFUSE = 0.38
@@ -21,26 +20,21 @@ MIN_DEPTH = 1e-3  # metres
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A parallelogram by its top left, top right and bottom left corner, as seen from its front.
+    """A parallelogram, visible only from its front.
 
-    Corners are in metres. The texture is (H, W, 3) uint8 BGR. A surface is visible only from its front.
+    Its top left corner and its edges to the right and down, as seen from its front, are in metres.
+    The texture is (H, W, 3) uint8 BGR.
     """
 
-    corners: ArrayLike  # (3, 3)
+    corner: Floats  # (3,)
+    right: Floats  # (3,)
+    down: Floats  # (3,)
     texture: Pixels
-
-    @property
-    def axes(self) -> Floats:
-        """The top left corner, and the edges to the right and down, as rows (3, 3)."""
-        corners = np.array(self.corners, np.float64)
-        corners[1:] -= corners[0]
-        return corners
 
     @property
     def normal(self) -> Floats:
         """The unit vector towards the front, (3,)."""
-        _, right, down = self.axes
-        normal = np.cross(down, right)
+        normal = np.cross(self.down, self.right)
         return np.asarray(normal / np.linalg.norm(normal))
 
     @property
@@ -52,34 +46,29 @@ class Surface:
 
 
 def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage, FloatImage]:
-    """Render an image (H, W, 3) float32 BGR in 0..255, and its depth (H, W) float32.
-
-    Depth is along the camera's axis, at pixel centres, in metres. The sky's depth is inf.
-    """
+    """Render an image (H, W, 3) float32 BGR in 0..255, and its nearness (H, W) at pixel centres."""
     fine = resized_camera(camera, RAYS)
     image = np.full((fine.height, fine.width, 3), SKY, np.uint8)
-    nearness = np.zeros(image.shape[:2], np.float32)  # 1 / depth, 0 for the sky
+    nearness = np.zeros(image.shape[:2], np.float32)
     for surface in surfaces:
         # Its back faces the camera.
-        if surface.normal @ (camera.centre - surface.axes[0]) < MIN_DEPTH:
+        if surface.normal @ (camera.centre - surface.corner) < MIN_DEPTH:
             continue
         _draw(surface, fine, image, nearness)
     # The mean of a pixel's rays.
     small = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    with np.errstate(divide="ignore"):
-        depth = 1 / nearness[RAYS // 2 :: RAYS, RAYS // 2 :: RAYS]
-    return np.asarray(small, np.float32), np.asarray(depth, np.float32)
+    centres = nearness[RAYS // 2 :: RAYS, RAYS // 2 :: RAYS]
+    return np.asarray(small, np.float32), centres
 
 
-def _draw(
-    surface: Surface, camera: SizedCamera, image: Pixels, nearness: NDArray[np.float32]
-) -> None:
+def _draw(surface: Surface, camera: SizedCamera, image: Pixels, nearness: FloatImage) -> None:
     """Draw a surface where nothing nearer is drawn: change the image and ``nearness`` in place."""
-    rows, columns = _extent(surface, camera)
-    # A (x, y, 1) = (u, v, 1) / depth is affine in the pixel. So comparisons need no division.
-    corner, right, down = surface.axes
-    axes = np.column_stack([right, down, corner - camera.centre])
-    A = np.linalg.inv(camera.K @ camera.R @ axes).astype(np.float32)
+    # From (u, v, 1), with u and v in 0..1 on the surface, to depth * (x, y, 1).
+    axes = np.column_stack([surface.right, surface.down, surface.corner - camera.centre])
+    to_image = camera.K @ camera.R @ axes
+    rows, columns = _extent(to_image, camera)
+    # Its inverse, (u, v, 1) / depth, is affine in the pixel. So comparisons need no division.
+    A = np.linalg.inv(to_image).astype(np.float32)
     y, x = (axis.astype(np.float32) for axis in np.ogrid[rows, columns])
     # x is a row and y a column, so only the outer sum has the size of the image.
     u, v, inverse = (row[0] * x + (row[1] * y + row[2]) for row in A)
@@ -102,19 +91,22 @@ def _draw(
     np.copyto(image[rows, columns], colours, where=hit[..., None])
 
 
-def _extent(surface: Surface, camera: SizedCamera) -> tuple[slice, slice]:
+def _extent(to_image: Floats, camera: SizedCamera) -> tuple[slice, slice]:
     """Return the rows and columns that a surface can touch.
 
     All of them if the surface reaches behind the camera, where its projection has no outline.
     """
-    corner, right, down = surface.axes
-    corners = [corner, corner + right, corner + down, corner + right + down]
-    pixels, depth = project(camera, np.array(corners))
-    size = (camera.width, camera.height)
+    x, y, depth = to_image @ [[0, 1, 0, 1], [0, 0, 1, 1], [1, 1, 1, 1]]
     if (depth < MIN_DEPTH).any():
         return slice(0, camera.height), slice(0, camera.width)
-    first = np.floor(pixels.min(axis=0))
-    last = np.ceil(pixels.max(axis=0)) + 1
-    left, top = np.clip(first, 0, size).astype(int).tolist()
-    right, bottom = np.clip(last, 0, size).astype(int).tolist()
-    return slice(top, bottom), slice(left, right)
+    rows = _span(y / depth, camera.height)
+    columns = _span(x / depth, camera.width)
+    return rows, columns
+
+
+def _span(positions: Floats, size: int) -> slice:
+    """Return the whole pixels in 0..size between the least and the greatest position."""
+    first = np.floor(positions.min())
+    last = np.ceil(positions.max())
+    start, stop = np.clip([first, last + 1], 0, size).astype(int)
+    return slice(start, stop)

@@ -1,6 +1,7 @@
 """Worlds of a ground, three walls and boxes with drawn textures, and their cameras."""
 
 from itertools import product
+from math import hypot
 from typing import NamedTuple
 
 import cv2
@@ -10,6 +11,8 @@ from numpy.typing import ArrayLike
 from mkpc_kaggle.demo.camera import Floats, SizedCamera, look_at, resized_camera
 from mkpc_kaggle.demo.render import Surface
 from mkpc_kaggle.geometry.coordinates import Pixels
+
+Point = tuple[float, float, float] | Floats  # (3,)
 
 TEXELS = 72  # per metre
 
@@ -37,37 +40,39 @@ MAX_BOX_M = (3.0, 3.0, 5.5)  # width, depth, height
 class Shot(NamedTuple):
     """A camera of a scene: position and target in metres, (width, height) in pixels."""
 
-    position: tuple[float, float, float]
-    target: tuple[float, float, float]
+    position: Point
+    target: Point
     focal: float  # over the long side
     size: tuple[int, int]
     roll: float  # in degrees
 
 
-SHOTS = (
-    Shot((-5.0, -7.0, 1.7), (-2.0, 20.0, 4.0), 0.75, (800, 600), 0),
-    Shot((-2.0, -6.0, 1.7), (-1.0, 20.0, 3.8), 0.80, (800, 533), 6),
-    Shot((7.0, -2.0, 1.6), (-3.0, 20.0, 4.5), 0.85, (600, 800), -9),
-    Shot((-1.0, 1.0, 3.2), (3.0, 19.0, 4.0), 1.60, (800, 600), 14),
-    Shot((-9.0, 4.0, 1.7), (4.0, 20.0, 4.0), 0.95, (800, 600), -4),
-    Shot((9.0, 4.5, 2.6), (-8.0, 19.0, 4.0), 1.00, (600, 800), 22),
-    Shot((-8.0, -4.0, 5.0), (6.0, 18.0, 4.2), 1.60, (800, 533), -12),
-)
+LANDSCAPE = (800, 600)
+PORTRAIT = (600, 800)
+FILM = (800, 533)
 WIDE = (1600, 1200)
-TELE = (800, 600)
+SHOTS = (
+    Shot((-5.0, -7.0, 1.7), (-2.0, 20.0, 4.0), 0.75, LANDSCAPE, 0),
+    Shot((-2.0, -6.0, 1.7), (-1.0, 20.0, 3.8), 0.80, FILM, 6),
+    Shot((7.0, -2.0, 1.6), (-3.0, 20.0, 4.5), 0.85, PORTRAIT, -9),
+    Shot((-1.0, 1.0, 3.2), (3.0, 19.0, 4.0), 1.60, LANDSCAPE, 14),
+    Shot((-9.0, 4.0, 1.7), (4.0, 20.0, 4.0), 0.95, LANDSCAPE, -4),
+    Shot((9.0, 4.5, 2.6), (-8.0, 19.0, 4.0), 1.00, PORTRAIT, 22),
+    Shot((-8.0, -4.0, 5.0), (6.0, 18.0, 4.2), 1.60, FILM, -12),
+)
 # Lenses of 1, 2 and 4 times the focal length. The wide photographs are as large as photographs of a
 # phone, compared to a matcher's view: a tele photograph shows more detail of its part than that view.
 TELEPHOTO = (
     Shot((-4.0, -6.0, 1.7), (-1.2, 20.0, 4.0), 0.75, WIDE, 2),
     Shot((3.0, -5.0, 1.7), (0.9, 20.0, 4.0), 0.75, WIDE, -3),
-    Shot((-6.0, -5.0, 1.8), (-7.0, 18.0, 3.0), 1.50, TELE, 4),
-    Shot((-3.5, -4.0, 1.8), (-2.0, 18.0, 4.0), 1.50, TELE, -2),
-    Shot((4.0, -3.0, 1.8), (3.0, 17.0, 3.0), 1.50, TELE, 3),
-    Shot((1.0, -2.0, 1.8), (7.0, 18.0, 4.0), 1.50, TELE, 0),
-    Shot((-1.0, -5.0, 1.8), (-7.0, 18.0, 3.0), 3.00, TELE, -3),
-    Shot((-3.5, -4.0, 1.8), (-2.0, 18.0, 4.0), 3.00, TELE, 2),
-    Shot((4.0, -3.0, 1.8), (3.0, 17.0, 3.0), 3.00, TELE, 0),
-    Shot((1.0, -2.0, 1.8), (7.0, 18.0, 4.0), 3.00, TELE, 4),
+    Shot((-6.0, -5.0, 1.8), (-7.0, 18.0, 3.0), 1.50, LANDSCAPE, 4),
+    Shot((-3.5, -4.0, 1.8), (-2.0, 18.0, 4.0), 1.50, LANDSCAPE, -2),
+    Shot((4.0, -3.0, 1.8), (3.0, 17.0, 3.0), 1.50, LANDSCAPE, 3),
+    Shot((1.0, -2.0, 1.8), (7.0, 18.0, 4.0), 1.50, LANDSCAPE, 0),
+    Shot((-1.0, -5.0, 1.8), (-7.0, 18.0, 3.0), 3.00, LANDSCAPE, -3),
+    Shot((-3.5, -4.0, 1.8), (-2.0, 18.0, 4.0), 3.00, LANDSCAPE, 2),
+    Shot((4.0, -3.0, 1.8), (3.0, 17.0, 3.0), 3.00, LANDSCAPE, 0),
+    Shot((1.0, -2.0, 1.8), (7.0, 18.0, 4.0), 3.00, LANDSCAPE, 4),
 )
 SCENES = {"courtyard": SHOTS, "market": SHOTS, "street": TELEPHOTO}
 
@@ -96,10 +101,10 @@ def _surfaces(rng: np.random.Generator) -> list[Surface]:
     The ground comes first, then the north wall (at y = 20), the west wall, the east wall and boxes.
     """
     surfaces = [
-        Surface(((-20, 20, 0), (20, 20, 0), (-20, -14, 0)), paint(rng, 40, 34, PAVING, STONE)),
-        Surface(((-14, 20, 10), (14, 20, 10), (-14, 20, 0)), facade(rng, 28, 10, SANDSTONE)),
-        Surface(((-14, -14, 8.5), (-14, 20, 8.5), (-14, -14, 0)), facade(rng, 34, 8.5, BRICK)),
-        Surface(((14, 20, 7.5), (14, -2, 7.5), (14, 20, 0)), facade(rng, 22, 7.5, PLASTER)),
+        painted(rng, (-20, 20, 0), (40, 0, 0), (0, -34, 0), PAVING, STONE),
+        facade(rng, (-14, 20, 10), (28, 0, 0), SANDSTONE),
+        facade(rng, (-14, -14, 8.5), (0, 34, 0), BRICK),
+        facade(rng, (14, 20, 7.5), (0, -22, 0), PLASTER),
     ]
     for x, y in product(COLUMNS_X_M, ROWS_Y_M):
         if rng.random() < BOX_SHARE:
@@ -109,24 +114,63 @@ def _surfaces(rng: np.random.Generator) -> list[Surface]:
     return surfaces
 
 
+def facade(rng: np.random.Generator, corner: Point, right: Point, colour: ArrayLike) -> Surface:
+    """Return a stone wall on the ground, with a grid of windows that differ only in brightness."""
+    width_m = hypot(*right)
+    height_m = corner[2]
+    wall = painted(rng, corner, right, (0, 0, -height_m), colour, STONE)
+    picture = wall.texture
+    scale = picture.shape[1] / width_m
+    width, height = WINDOW_M
+    w = int(width * scale)
+    h = int(height * scale)
+    # One pane for all windows: repetition is what makes facades hard to match.
+    pane = cv2.resize(paint(rng, width, height, GLASS, PAINT), (w, h))
+    # The first windows are 1.2 m from the edges.
+    for y in np.arange(1.2, height_m - height, WINDOW_STEP_M):
+        for x in np.arange(1.2, width_m - width, WINDOW_STEP_M):
+            left = int(x * scale)
+            bottom = picture.shape[0] - int(y * scale)  # rows run down
+            # A frame of six pixels; OpenCV's rectangles include both corners.
+            frame = (left - 6, bottom - h - 6, w + 12, h + 12)
+            cv2.rectangle(picture, frame, FRAME, -1)
+            lit = np.clip(pane * rng.uniform(0.7, 1.6), 0, 255)
+            picture[bottom - h : bottom, left : left + w] = lit
+    return wall
+
+
 def box(rng: np.random.Generator, centre: Floats, size: Floats, yaw: float) -> list[Surface]:
-    """Return the four sides and the top of a painted box on the ground.
+    """Return the top and the four sides of a painted box on the ground.
 
     `centre` is (x, y), `size` is (width, depth, height), `yaw` is in degrees.
     """
-    width, depth, height = size.tolist()
     # Counter-clockwise from above, beginning with the first side's left end.
     signs = np.array([[-1, 1], [-1, -1], [1, -1], [1, 1]])
     turn = cv2.getRotationMatrix2D((0, 0), yaw, 1)[:, :2]
-    corners = signs * (width / 2, depth / 2) @ turn + centre
-    low = np.column_stack([corners, np.zeros(4)])
-    high = np.add(low, (0, 0, height))
+    ground = signs * size[:2] / 2 @ turn + centre
+    corners = np.column_stack([ground, np.full(4, size[2])])
+    edges = np.roll(corners, -1, axis=0) - corners
     colour = rng.integers(60, 205, 3)  # the sides have tones of it
-    found = [Surface((high[0], high[3], high[1]), paint(rng, width, depth, colour, PAINT))]
-    for left, width_m in enumerate((depth, width, depth, width)):
-        side = paint(rng, width_m, height, colour, PAINT)
-        found.append(Surface((high[left], high[(left + 1) % 4], low[left]), side))
-    return found
+    top = painted(rng, corners[0], -edges[3], edges[0], colour, PAINT)
+    down = (0, 0, -size[2])
+    sides = [
+        painted(rng, corner, edge, down, colour, PAINT)
+        for corner, edge in zip(corners, edges, strict=True)
+    ]
+    return [top, *sides]
+
+
+def painted(
+    rng: np.random.Generator,
+    corner: Point,
+    right: Point,
+    down: Point,
+    colour: ArrayLike,
+    leaves: tuple[float, float, float],
+) -> Surface:
+    """Return a surface with a painted texture of its size."""
+    texture = paint(rng, hypot(*right), hypot(*down), colour, leaves)
+    return Surface(np.asarray(corner), np.asarray(right), np.asarray(down), texture)
 
 
 def paint(
@@ -165,26 +209,4 @@ def paint(
             cv2.rectangle(picture, low, high, tone, -1)
         else:
             cv2.ellipse(picture, (centre, side, angle), tone, -1, cv2.LINE_AA)
-    return picture
-
-
-def facade(rng: np.random.Generator, width_m: float, height_m: float, colour: ArrayLike) -> Pixels:
-    """Draw a stone wall with a grid of windows that differ only in brightness."""
-    picture = paint(rng, width_m, height_m, colour, STONE)
-    scale = picture.shape[1] / width_m
-    width, height = WINDOW_M
-    w = int(width * scale)
-    h = int(height * scale)
-    # One pane for all windows: repetition is what makes facades hard to match.
-    pane = cv2.resize(paint(rng, width, height, GLASS, PAINT), (w, h))
-    # The first windows are 1.2 m from the edges.
-    for y in np.arange(1.2, height_m - height, WINDOW_STEP_M):
-        for x in np.arange(1.2, width_m - width, WINDOW_STEP_M):
-            left = int(x * scale)
-            bottom = picture.shape[0] - int(y * scale)  # rows run down
-            # A frame of six pixels; OpenCV's rectangles include both corners.
-            frame = (left - 6, bottom - h - 6, w + 12, h + 12)
-            cv2.rectangle(picture, frame, FRAME, -1)
-            lit = np.clip(pane * rng.uniform(0.7, 1.6), 0, 255)
-            picture[bottom - h : bottom, left : left + w] = lit
     return picture

@@ -36,12 +36,12 @@ class DemoSet:
 
 
 class Photograph(NamedTuple):
-    """A picture (H, W, 3) uint8 BGR with its camera and its depth, (H, W) float32 in metres."""
+    """A picture (H, W, 3) uint8 BGR with its camera and its nearness, (H, W) float32."""
 
     name: str
     camera: SizedCamera
     picture: Pixels
-    depth: FloatImage
+    nearness: FloatImage
 
 
 class DemoPair(NamedTuple):
@@ -68,7 +68,7 @@ def write_demo(
         photographs = take_photographs(scene, image_scale)
         pairs = []
         for a, b in combinations(photographs, 2):
-            share = covisibility(b.camera, b.depth, a.camera, a.depth)
+            share = covisibility(b.camera, b.nearness, a.camera, a.nearness)
             pairs.append(DemoPair(b, a, share))
         _write_train(demo.train_dir / scene, photographs, pairs)
         rows += _write_test(demo.test_dir, scene, _selected(pairs))
@@ -102,10 +102,10 @@ def take_photographs(scene: str, image_scale: float) -> list[Photograph]:
     photographs = []
     surfaces, cameras = build_world(scene, image_scale=image_scale)
     for number, camera in enumerate(counted(cameras, f"rendering {scene}", "image")):
-        image, depth = render(surfaces, camera)
+        image, nearness = render(surfaces, camera)
         rng = np.random.default_rng([0, number, *scene.encode()])
         name = f"{scene}_{number:04d}"
-        photographs.append(Photograph(name, camera, _developed(image, rng), depth))
+        photographs.append(Photograph(name, camera, _developed(image, rng), nearness))
     return photographs
 
 

@@ -169,7 +169,7 @@ class PairwiseMatcher(Generic[Encoding]):
     ...     spec = MatcherSpec("identity")
     ...
     ...     def encode(self, pictures):
-    ...         return [np.argwhere(np.ones((10, 10))) * 20.0 for picture in pictures]
+    ...         return [np.argwhere(np.ones((10, 10))) * 8.0 for picture in pictures]
     ...
     ...     def _match(self, first, second):
     ...         return Matches(first, second, np.ones(len(first)))

@@ -71,6 +71,6 @@ def write_two_views(directory: Path) -> None:
     (directory / "photographs").mkdir()
     parts = [("a.jpg", 0), ("b.jpg", 40), *((f"photographs/{n}.jpg", 20 * n) for n in range(3))]
     for name, shift in parts:
-        # Small, because RootSIFT enlarges a view to 1,536 pixels.
-        part = photograph[60:300, 60 + shift : 420 + shift]
+        # A strip, because RootSIFT enlarges a view to 1,536 pixels.
+        part = photograph[120:220, 60 + shift : 420 + shift]
         assert cv2.imwrite(str(directory / name), part)
