@@ -7,7 +7,7 @@ from mkpc_kaggle.data.competition import read_test_side, submission_problem
 from mkpc_kaggle.errors import plural
 
 HELP = """\
-Compare a submission with test.csv: header, ids and their order, nine finite numbers per row.
+Compare a submission with test.csv: header, ids and their order, nine finite numbers per row, not all zero.
 
 Exit status: 0 good, 1 not good (the first problem is printed), 2 the test side cannot be read.
 """

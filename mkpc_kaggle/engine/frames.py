@@ -61,7 +61,7 @@ class Results:
     without a camera. Columns that name a pair have its id. Columns that name an image have its
     path below the directory of the run's images. ``f11`` to ``f33`` of ``pairs`` are F; ``own`` is the F of
     the pair's matches alone, and ``magsac`` that before the prior, nine numbers or ``None``. ``choice`` is the
-    reason why F is the scene's or not, ``units`` the number of units that ran or failed, and ``error`` the
+    reason why F is the scene's or not, ``units`` the number of units that are known or failed, and ``error`` the
     error that left the pair without an F, if it was not for few matches.
     """
 

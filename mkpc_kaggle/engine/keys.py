@@ -2,7 +2,9 @@
 
 A result is up to date exactly if it is stored under the key that a computation today would have.
 Nothing else says so. Each kind has a version of its algorithm: increase it if the same inputs give
-other results. ``POINTS_VERSION`` is that of all matchers of the package. A matcher that a user gives
+other results. Points depend on the unit, its matcher's options, precision, weight files and packages
+(:meth:`mkpc_kaggle.setup.assembly.Assembly.unit_settings`), on both images and, for crops, on earlier points.
+``POINTS_VERSION`` is that of all matchers of the package. A matcher that a user gives
 in Python has its own, ``MatcherSpec.version``.
 """
 

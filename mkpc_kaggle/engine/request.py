@@ -96,14 +96,13 @@ class Request:
 class PairInputs:
     """Inputs of a job on a pair: its images, and the keys of its points by unit, in the recipe's order.
 
-    For a scene, ``estimate`` is the key of the pair's estimate, and ``own`` its F.
+    For a scene, ``own`` is the F of the pair.
     """
 
     index: int
     pair: Pair
     images: Images
     points: Mapping[Unit, str]
-    estimate: str = ""
     own: Matrix3 | None = None
 
 

@@ -250,7 +250,7 @@ class Run:
                     continue
                 # In the recipe's order, as a crop's key has those of the points before it
                 key = state.key(index, unit)
-                rows.append(points_row(key, result, outcome.regions or ()))
+                rows.append(points_row(key, result))
                 state.use_points(index, unit, key, len(result.matches), is_needed=result.is_needed)
                 # A unit that the pair does not need took no time.
                 if result.is_needed:
@@ -306,8 +306,10 @@ class Run:
         - A lost unit of a pair is tried once more, alone, and then given up in this run.
         - Only a job of pairs that were never lost counts against its place. Three in a row, without an answer in
           between, close it, and its losses are taken back. After a loss, it continues elsewhere in the order.
-        - A unit that never ran is at fault itself when it was lost on more pairs than there are places. Where a
+        - A unit that never ran is at fault itself when it was lost in more jobs than there are places. Where a
           place has answered, that does not count against the place.
+
+        A place that never answered is closed at its first repeated loss, if another can take over.
         """
         if job is not None:
             self.state.release(job)
@@ -353,7 +355,7 @@ class Run:
             place.strikes = MAX_LOSSES
 
     def _skip_units(self, failure: Failure) -> None:
-        """Skip the units that never ran, and were lost on more pairs than there are places."""
+        """Skip the units that never ran, and were lost in more jobs than there are places."""
         state = self.state
         dead = state.unit_losses > max(1, len(self.site.of(Kind.MATCH)))
         for unit in np.flatnonzero(dead & ~state.dead).tolist():

@@ -161,7 +161,7 @@ def run_pairs(
 
     ``scenes_dir`` and ``publish`` are as in :class:`mkpc_kaggle.engine.request.Request`, ``files`` as in
     :class:`mkpc_kaggle.engine.request.About`. Raises :class:`mkpc_kaggle.errors.UserError` if the store cannot be
-    used or a matcher cannot be loaded, and for F from cameras with distortion.
+    used or no worker can start, and for F from cameras with distortion.
     """
     scene = assembly.recipe.scene
     if scenes_dir is None and scene is not None and scene.camera_model not in PINHOLES:

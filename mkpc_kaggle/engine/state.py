@@ -64,7 +64,7 @@ class State:
     Of a unit (U,): ``unit_losses``, lost jobs of a unit that never ran; ``dead``, no worker runs it.
 
     Of the B batches and C candidates of their scenes: ``made`` (B, C), the finished ones from today's results;
-    ``scenes``, the one in use by batch, with the smallest disagreement; ``scene_losses`` (B, C); ``stale`` (B,),
+    ``scenes``, the one in use by batch (``best_of``); ``scene_losses`` (B, C); ``stale`` (B,),
     the scene is not today's; ``making``, (batch, candidate) under way. ``batch_of`` (N,) is -1 without a batch.
     """
 
@@ -187,7 +187,7 @@ class State:
           lengths of the scene;
         - the fallback.
         """
-        by_scene = self.scene_source != FALLBACK
+        by_scene = (self.scene_source != FALLBACK) & are_models(self.by_scene)
         sources = np.where(by_scene, self.scene_source, np.where(self.has_f, PAIR, FALLBACK))
         matrices = np.where(by_scene[:, None, None], self.by_scene, self.F)
         # The last gate of the submission: the competition refuses a whole file for one matrix.
@@ -244,7 +244,6 @@ class State:
             self.pairs[index],
             self.images_of(index),
             self.points_of(index, units),
-            self.estimate[index].decode(),
             self.F[index] if self.has_f[index] else None,
         )
 
@@ -258,7 +257,7 @@ class State:
                 *self.names[each.index],
                 self.contents(each.index),
                 [*each.points.values()],
-                each.estimate,
+                self.estimate[each.index].decode(),
             ]
             for each in pairs
         ]

@@ -18,7 +18,7 @@ from time import monotonic
 from typing import Any, Self
 
 from mkpc_kaggle.errors import UserError, printable, writing
-from mkpc_kaggle.geometry.critical_region import CriticalRegion, regions_json
+from mkpc_kaggle.geometry.critical_region import regions_json
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 
@@ -56,7 +56,7 @@ REVISION = 1
 STORE_FORMAT = zlib.crc32(f"{REVISION} {SCHEMA}".encode()) >> 1  # SQLite has 31 bits for it
 
 
-def points_row(key: str, result: UnitResult, regions: Iterable[CriticalRegion]) -> tuple[Any, ...]:
+def points_row(key: str, result: UnitResult) -> tuple[Any, ...]:
     """Return the row of a unit's points on a pair. A unit that the pair does not need has no data."""
     need = result.need
     return (
@@ -66,7 +66,7 @@ def points_row(key: str, result: UnitResult, regions: Iterable[CriticalRegion]) 
         result.seconds,
         None if need is None else need.scale,
         None if need is None else need.detail,
-        regions_json(regions) if result.unit.stage == 2 else "",
+        regions_json(result.regions) if result.regions else "",
         result.note,
         result.matches.to_bytes() if result.is_needed else None,
     )

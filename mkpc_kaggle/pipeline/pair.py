@@ -38,6 +38,7 @@ class UnitResult:
     note: str = ""  # why the unit did not run as written
     keypoints: int = 0  # detected in the first view; 0 for a matcher without a detector
     need: CropNeed | None = None  # of stage 2; one that is not needed has no matches
+    regions: Regions | None = None  # of stage 2: its crops
 
     @property
     def is_needed(self) -> bool:

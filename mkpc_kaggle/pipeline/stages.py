@@ -157,7 +157,9 @@ class Pipeline:
                     pairs[index] = with_regions(pair, self.recipe, unit)
                     need = need_of(unit, pairs[index], self.recipe)
                     if not need.is_needed:
-                        result = UnitResult(unit, Matches.empty(), need=need)
+                        result = UnitResult(
+                            unit, Matches.empty(), need=need, regions=pairs[index].regions
+                        )
                         pairs[index] = replace(pairs[index], results=(*pair.results, result))
                         continue
                 waiting.append(index)
@@ -281,6 +283,7 @@ class Pipeline:
                 note=self._notes.get(unit.matcher, ""),
                 keypoints=len(getattr(encoding, "points", ())),
                 need=need_of(unit, pair, self.recipe) if unit.stage == 2 else None,
+                regions=pair.regions if unit.stage == 2 else None,
             )
             results.append(result)
         return results

@@ -104,14 +104,14 @@ class Room:
 
     def match(self, index: int, *units: Unit, need: CropNeed | None = None) -> None:
         """Save points of a pair."""
-        found = tuple(
-            UnitResult(unit, matches_of(index), 0.5, 0.25, need=need if unit.stage == 2 else None)
-            for unit in units
-        )
+        found = []
+        for unit in units:
+            of_crops = {"need": need, "regions": REGIONS} if unit.stage == 2 else {}
+            found.append(UnitResult(unit, matches_of(index), 0.5, 0.25, **of_crops))
         plan = MatchPlan(SWEEPING, [index], [], [], 0.0, [])
         inputs = self.state.inputs_of(index)
         job = MatchJob((inputs,), self.state.request.recipe, Source(), plan)
-        self.run.save(job, (PairMatch(found, REGIONS),), 0.5)
+        self.run.save(job, (PairMatch(tuple(found)),), 0.5)
 
     def estimate(self, index: int) -> None:
         inputs = self.state.inputs_of(index)
