@@ -81,7 +81,8 @@ def run(arguments: argparse.Namespace) -> int:
             logger.info("\n".join(filter(None, lines)))
             _, images = test_side(arguments.test_dir)
             report = submit(pairs, assembly, session, output, str(images))
-            unwritten, unsaved = report.about.unwritten, report.about.unsaved
+            unwritten = report.about.unwritten
+            unsaved = report.about.unsaved
             session.status = int(bool(unwritten or unsaved or trouble(report)))
             reason = f" is not the last version: {unwritten}" if unwritten else ""
             # A file that could not be replaced is an earlier version; it is complete, too.

@@ -86,7 +86,8 @@ class Plan:
     @cached_property
     def left(self) -> float:
         """The seconds until no unit may run, so that estimates, scenes and candidates have theirs."""
-        state, crew = self.state, self.crew
+        state = self.state
+        crew = self.crew
         waiting = int(state.lacks_estimate.sum())
         seconds = self.costs.mean(COST_OF_ESTIMATES) * waiting / max(1, crew.estimators)
         if crew.scenes:
@@ -173,7 +174,8 @@ class Plan:
         """
         if self.phase == NEVER:
             return None
-        state, costs = self.state, self.costs
+        state = self.state
+        costs = self.costs
         order = self._order()
         pairs = order[:1]
         wanted = self.wanted <= self.phase
@@ -253,7 +255,8 @@ class Plan:
         held = held | (self.first < FILL) | (state.busy < FILL)
         if not self.left:
             # No unit begins any more, and it is too late to wait for estimates. A hung job may last until the end.
-            held, later = np.zeros_like(busy), busy
+            held = np.zeros_like(busy)
+            later = busy
         has_scene = state.made[:, 0].astype(bool)
         waits = np.where(has_scene, state.by_batch(later), state.by_batch(held)) > 0
         is_matching = self.match is not None or bool(busy.any())

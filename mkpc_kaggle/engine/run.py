@@ -145,7 +145,8 @@ class Run:
             self.state.unit_losses[is_refused] = REFUSED
             self.state.dead |= is_refused
             return
-        job, place.job = place.job, None
+        job = place.job
+        place.job = None
         if isinstance(answer, Failure):
             self.lose(place, job, answer)
         elif job is not None:

@@ -202,7 +202,9 @@ def run_pairs(
 
 
 def _site(pairs: Sequence[Pair], assembly: Assembly, session: Session) -> Site:
-    clock, workers, log = session.budget.clock, session.workers, session.work_dir / WORKERS_LOG
+    clock = session.budget.clock
+    workers = session.workers
+    log = session.work_dir / WORKERS_LOG
     if isinstance(workers, str):
         # The folders of the images must exist on every machine.
         folders = dict.fromkeys(path.parent for pair in pairs for path in pair.images)

@@ -47,7 +47,8 @@ def summary(found: Results) -> str:
 
 def headline(found: Results) -> str:
     """Return a line: how the run ended, its duration, and the numbers of F and of cameras."""
-    pairs, scenes = found.pairs, found.scenes
+    pairs = found.pairs
+    scenes = found.scenes
     text = f"{is_solved(pairs).sum()} of {plural(len(pairs), 'pair')} with an F"
     if len(scenes):
         images = plural(int(scenes["images"].sum()), "image")
@@ -86,7 +87,9 @@ def unit_table(units: "DataFrame") -> "DataFrame":
 
 def failures(found: Results) -> list[str]:
     """Return a line for each kind of failure: of pairs, batches, images and units; then all faults."""
-    pairs, units, scenes = found.pairs, found.units, found.scenes
+    pairs = found.pairs
+    units = found.units
+    scenes = found.scenes
     unsolved = pairs[is_reached(pairs) & ~is_solved(pairs)]
     lines = grouped(unsolved, "pair", "pair", "without an F")
     is_pending = scenes["failure"] == NOT_RECONSTRUCTED
@@ -128,7 +131,8 @@ def first(lines: Sequence[str], most: int) -> list[str]:
 
 def pending(found: Results) -> str:
     """Return a line on the pairs and batches that the run did not reach; empty without any."""
-    pairs, scenes = found.pairs, found.scenes
+    pairs = found.pairs
+    scenes = found.scenes
     # A pair may have an F from a scene without being matched.
     has_f = pairs["source"].isin(["scene", "pair"])
     waiting = int((~is_reached(pairs) & ~has_f).sum())
