@@ -7,7 +7,7 @@ import pytest
 from mkpc_kaggle.reporting import page
 
 
-@pytest.fixture(scope="package", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def one_picture() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page, "MAX_PICTURES", 1)
