@@ -42,7 +42,10 @@ NO_ENLARGEMENT = ", enlarge = false"
 # By name: (stage, long side) of each unit, more keys of the units, the table [mkpc]
 LAYOUTS: dict[str, tuple[tuple[tuple[int, int], ...], str, str]] = {
     "one": (((1, 1024),), "", ""),
-    **{f"whole {side}": (((1, 1024), (1, side)), "", "") for side in (512, 640, 768, 1280, 1536)},
+    **{
+        f"whole {side}": (((1, 1024), (1, side)), "", "")
+        for side in (512, 640, 768, 1280, 1536)
+    },
     "whole 1280 as stored": (((1, 1024), (1, 1280)), NO_ENLARGEMENT, ""),
     "whole 1536 as stored": (((1, 1024), (1, 1536)), NO_ENLARGEMENT, ""),
     **{f"crop {side}": (((1, 1024), (2, side)), "", "") for side in (768, 1024, 1280)},
@@ -95,7 +98,9 @@ def groups_of(scenes: Sequence[str], chosen: str) -> dict[str, list[int]]:
     """Return the indices of the scenes of each group of the last tables, by the group's name."""
     groups = {"all": list(range(len(scenes)))}
     for scale in sorted(set(re.findall(r"_zoom(\d)", " ".join(scenes)))):
-        groups[f"x{scale}"] = [i for i in groups["all"] if scenes[i].endswith(f"_zoom{scale}")]
+        groups[f"x{scale}"] = [
+            i for i in groups["all"] if scenes[i].endswith(f"_zoom{scale}")
+        ]
     if chosen:
         groups["chosen on"] = [i for i in groups["all"] if re.match(chosen, scenes[i])]
         groups["confirmed on"] = [i for i in groups["all"] if not re.match(chosen, scenes[i])]
@@ -108,7 +113,9 @@ def gain_lines(runs: Sequence[Run], layouts: Sequence[str], chosen: str) -> list
     groups = groups_of([scene["scene"] for scene in scenes], chosen)
     lines = []
     for name, other in zip(layouts[:-1], runs[:-1], strict=True):
-        lines.append(f"\n{layouts[-1]} against {name}: both, and the gain with its 95 % interval")
+        lines.append(
+            f"\n{layouts[-1]} against {name}: both, and the gain with its 95 % interval"
+        )
         pairs: list[Paired] = []
         for before, after in zip(other["scenes"], scenes, strict=True):
             images = [images_of(pair) for pair in after["pairs"]]
@@ -130,7 +137,9 @@ def main() -> int:
     parser.add_argument("--matcher", default="aliked_lightglue")
     parser.add_argument("--rootsift", action="store_true", help="its unit of `light` first")
     parser.add_argument("--layouts", nargs="+", choices=list(LAYOUTS), default=list(LAYOUTS))
-    parser.add_argument("--chosen", default="", metavar="REGEX", help="start of scenes' names")
+    parser.add_argument(
+        "--chosen", default="", metavar="REGEX", help="start of scenes' names"
+    )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("options", nargs="*")
     given = parser.parse_args()

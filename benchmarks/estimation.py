@@ -103,7 +103,9 @@ PAIR_ESTIMATORS: dict[str, Estimator] = {
 }
 
 
-def by_scene(settings: str, pairs: Sequence[Known], every: Sequence[Known]) -> list[Matrix3 | None]:
+def by_scene(
+    settings: str, pairs: Sequence[Known], every: Sequence[Known]
+) -> list[Matrix3 | None]:
     """Return the F of pairs reconstructed as one batch, together with extra pairs."""
     config = from_table(SceneConfig, tomllib.loads(settings), settings)
     batch = [batch_pair(pair.true, pair.found, pair.F) for pair in pairs]
@@ -130,7 +132,9 @@ def batch_pair(true: TruePair, found: PairMatch, F: Matrix3 | None = None) -> Ba
     return BatchPair(image0, image1, by_unit, F, tracks_of(found.results))
 
 
-def extra_of(pairs: Sequence[Known], every: Sequence[Known], config: SceneConfig) -> list[Known]:
+def extra_of(
+    pairs: Sequence[Known], every: Sequence[Known], config: SceneConfig
+) -> list[Known]:
     """Return the extra pairs that the engine would add."""
     names = list(dict.fromkeys(name for pair in pairs for name in pair.names))
     number = {name: index for index, name in enumerate(names)}
@@ -156,7 +160,9 @@ def read_journal(directory: Path) -> tuple[str, Journal]:
     # Others were never matched, or have an unreadable image.
     pairs = tables.pairs[tables.pairs["units"] > 0]
     found = {}
-    for pair, match in zip(pairs.to_dict("records"), tables.matches(*pairs["pair"]), strict=True):
+    for pair, match in zip(
+        pairs.to_dict("records"), tables.matches(*pairs["pair"]), strict=True
+    ):
         known = replace(match, sizes=(sizes[pair["image0"]], sizes[pair["image1"]]))
         F = None if pair["failure"] else np.reshape(pair["own"], (3, 3))
         found[pair["pair"]] = (known, F)
@@ -240,7 +246,9 @@ def table(title: str, draws: Draws, names: Sequence[str]) -> list[str]:
         means = [mean(values) for values in maas.values()]
         cells = [f"{value:.3f}" for value in (*means, mean(means))]
         gain = "" if name == names[0] else str(difference(draws, names[0], name))
-        lines.append(f"| {name} | {' | '.join(cells)} | {gain} | {_seconds(draws, name):.2f} |")
+        lines.append(
+            f"| {name} | {' | '.join(cells)} | {gain} | {_seconds(draws, name):.2f} |"
+        )
         if gain:
             gains = []
             for scene, scores in draws.items():
@@ -274,14 +282,18 @@ def draws_of(
     seeds: int,
 ) -> list[dict[str, Score]]:
     """Return the scores of each draw of a scene by estimate; none if the journal has other scenes."""
-    every = [Known(true, *journal[true.pair.id]) for true in scene.pairs if true.pair.id in journal]
+    every = [
+        Known(true, *journal[true.pair.id]) for true in scene.pairs if true.pair.id in journal
+    ]
     if not every:
         return []
     draws = []
     # All images of a scene make a single draw.
     for seed in range(seeds if images else 1):
         pairs, inside = drawn(every, images, seed)
-        draws.append({name: score(make, pairs, inside, scene) for name, make in estimators.items()})
+        draws.append(
+            {name: score(make, pairs, inside, scene) for name, make in estimators.items()}
+        )
     return draws
 
 
@@ -301,7 +313,9 @@ def main() -> None:
     add("--estimates", nargs="+", choices=names, default=names)
     add("--settings", nargs="+", default=[""], metavar="TOML")
     arguments = parser.parse_args()
-    estimators = {name: PAIR_ESTIMATORS[name] for name in arguments.estimates if name != SCENE}
+    estimators = {
+        name: PAIR_ESTIMATORS[name] for name in arguments.estimates if name != SCENE
+    }
     if arguments.thresholds:
         estimators = {}
         for pixels in arguments.thresholds:
@@ -315,7 +329,9 @@ def main() -> None:
     for directory in arguments.journals:
         recipe, journal = read_journal(directory)
         found = {
-            scene.name: draws_of(scene, journal, estimators, arguments.images, arguments.seeds)
+            scene.name: draws_of(
+                scene, journal, estimators, arguments.images, arguments.seeds
+            )
             for scene in scenes
         }
         draws = {name: scores for name, scores in found.items() if scores}

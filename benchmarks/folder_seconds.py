@@ -38,7 +38,9 @@ from mkpc_kaggle.progress import counted
 
 HERE = Path(__file__).resolve().parents[1]
 # A library with more threads waits actively, which would count as work.
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
+)
 RENDERED = (768, 576)  # width and height of a rendered photograph, in pixels
 RENDERED_FOCAL = 0.9  # over the width
 ALONE = "from benchmarks.folder_seconds import pycolmap_alone; pycolmap_alone(*__import__('sys').argv[1:])"
@@ -139,7 +141,15 @@ def programs_of(arguments: argparse.Namespace) -> list[Program]:
         for mapper in arguments.mappers
     ]
     package = (python, "-m", "mkpc_kaggle")
-    command = (*package, "reconstruct", "{images}", "--out", "{out}", "--recipe", arguments.recipe)
+    command = (
+        *package,
+        "reconstruct",
+        "{images}",
+        "--out",
+        "{out}",
+        "--recipe",
+        arguments.recipe,
+    )
     ours = [Program("reconstruct", command)]
     for each in arguments.code:
         name, _, checkout = each.partition("=")
@@ -179,7 +189,9 @@ def main() -> None:
         "--mappers", nargs="*", default=["incremental", "global"], help="of pycolmap alone"
     )
     parser.add_argument("--recipe", default="auto")
-    parser.add_argument("--render", type=int, metavar="N", help="into the new folder of --images")
+    parser.add_argument(
+        "--render", type=int, metavar="N", help="into the new folder of --images"
+    )
     arguments = parser.parse_args()
     if arguments.render:
         write_rendered(arguments.images[0], arguments.render)

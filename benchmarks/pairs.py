@@ -74,7 +74,9 @@ def random_network(make: Callable[[], nn.Module], placement: Placement) -> Any:
 
 def loma(variant: Variant, placement: Placement) -> LomaAdapter:
     network = random_network(partial(Loma, variant), placement)
-    return LomaAdapter(network, LomaOptions(variant, max_keypoints=KEYPOINTS), placement.device)
+    return LomaAdapter(
+        network, LomaOptions(variant, max_keypoints=KEYPOINTS), placement.device
+    )
 
 
 def roma(placement: Placement) -> DenseMatcher:
@@ -87,7 +89,11 @@ def with_lightglue(
 ) -> Callable[[Placement], Matcher[Any]]:
     """Return the maker of a LightGlue matcher with stand-in weights."""
     return partial(
-        light_matchers.lightglue_matcher, name, keypoints=keypoints, layers=layers, threshold=0.1
+        light_matchers.lightglue_matcher,
+        name,
+        keypoints=keypoints,
+        layers=layers,
+        threshold=0.1,
     )
 
 
@@ -104,7 +110,10 @@ CASES = {
     "superglue": Case(partial(light_matchers.superglue_matcher, keypoints=KEYPOINTS), SPARSE),
     "loma, b128": Case(partial(loma, Variant.B128), SPARSE),
     "loma, b": Case(partial(loma, Variant.B), SPARSE),
-    **{name: Case(MATCHERS[name], SEMI_DENSE) for name in ("loftr", "quadtree", "aspanformer")},
+    **{
+        name: Case(MATCHERS[name], SEMI_DENSE)
+        for name in ("loftr", "quadtree", "aspanformer")
+    },
     "dkm": Case(partial(light_matchers.dkm_matcher, matches=5000), Size(720, 540)),
     "roma": Case(roma, Size(864, 864)),
 }
@@ -123,7 +132,9 @@ def pictures_of(size: Size, colour: Colour, multiple: int) -> list[Picture]:
     pictures = []
     for rgb in photographs(size):
         is_gray = colour is Colour.GRAY
-        pixels = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) if is_gray else rgb, np.uint8)
+        pixels = np.asarray(
+            cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) if is_gray else rgb, np.uint8
+        )
         pictures.append(Picture(view.render(pixels), view))
     return pictures
 
@@ -193,10 +204,15 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--precision", choices=list(Precision), default=Precision.FLOAT32)
     parser.add_argument(
-        "--only", default=",".join(RUNS), metavar="NAMES", help="matchers, by parts of their names"
+        "--only",
+        default=",".join(RUNS),
+        metavar="NAMES",
+        help="matchers, by parts of their names",
     )
     parser.add_argument(
-        "--memory-of", metavar="NAME", help="run this matcher once and print the process's peak"
+        "--memory-of",
+        metavar="NAME",
+        help="run this matcher once and print the process's peak",
     )
     arguments = parser.parse_args()
     placement = Placement(precision=Precision(arguments.precision))

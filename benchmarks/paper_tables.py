@@ -124,7 +124,9 @@ def largest_side(recipe: Recipe) -> int:
     return max(unit.long_side or max(map(int, unit.area.split("x"))) for unit in sides)
 
 
-def scores_of_list(found: Results, scene: TrainScene, method: str, side: int) -> list[ListScore]:
+def scores_of_list(
+    found: Results, scene: TrainScene, method: str, side: int
+) -> list[ListScore]:
     """Score the matches of a run by SuperGlue's evaluation, with an estimator."""
     names = [true.pair.id for true in scene.pairs]
     units = dict(list(found.units.groupby("pair")))
@@ -146,7 +148,9 @@ def scores_of_list(found: Results, scene: TrainScene, method: str, side: int) ->
         # Dense matchers have matches and no keypoints.
         is_known = ran is None or ((ran["keypoints"] > 0) | (ran["matches"] == 0)).all()
         precision = correct / max(len(matches), 1)
-        scores.append(ListScore(error, precision, correct / max(keypoints, 1) if is_known else nan))
+        scores.append(
+            ListScore(error, precision, correct / max(keypoints, 1) if is_known else nan)
+        )
     return scores
 
 
@@ -198,7 +202,10 @@ def table(name: str, given: argparse.Namespace) -> Iterator[str]:
     is_imc = name == "imc"
     if is_imc:
         ours = ["mAA"]
-        theirs = ["public", "private"]  # of the leaderboard; one score of ours is compared to both
+        theirs = [
+            "public",
+            "private",
+        ]  # of the leaderboard; one score of ours is compared to both
     else:
         theirs = [f"AUC {limit:g}" for limit in AUC_THRESHOLDS]
         ours = [*theirs, "precision", "matching score"]

@@ -33,7 +33,9 @@ def matched(database: Path, images: Path, one_camera: bool) -> None:
     pycolmap.extract_features(
         database,
         images,
-        camera_mode=pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.PER_IMAGE,
+        camera_mode=pycolmap.CameraMode.SINGLE
+        if one_camera
+        else pycolmap.CameraMode.PER_IMAGE,
         reader_options=reader,
         device=pycolmap.Device.cpu,
     )
@@ -42,7 +44,9 @@ def matched(database: Path, images: Path, one_camera: bool) -> None:
 
 def models(mapper: str, database: Path, images: Path, folder: Path) -> list[Cameras]:
     """Return the cameras of every model by image id, the largest model first."""
-    mapping = pycolmap.incremental_mapping if mapper == "incremental" else pycolmap.global_mapping
+    mapping = (
+        pycolmap.incremental_mapping if mapper == "incremental" else pycolmap.global_mapping
+    )
     found = mapping(database, images, folder)
     cameras = [cameras_of(model) for model in found.values()]
     return sorted(cameras, key=len, reverse=True)
@@ -102,9 +106,14 @@ def main() -> None:
     parser.add_argument("--train-dir", type=Path, required=True)
     parser.add_argument("--scenes", nargs="*", default=())
     parser.add_argument(
-        "--mappers", nargs="+", default=["incremental", "global"], choices=["incremental", "global"]
+        "--mappers",
+        nargs="+",
+        default=["incremental", "global"],
+        choices=["incremental", "global"],
     )
-    parser.add_argument("--one-camera", action="store_true", help="that took all images of a scene")
+    parser.add_argument(
+        "--one-camera", action="store_true", help="that took all images of a scene"
+    )
     arguments = parser.parse_args()
     # Its lines would be between the table's.
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value

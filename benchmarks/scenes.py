@@ -19,7 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.synthetic_scene import SyntheticScene, registered_images, street, synthetic_scene
+from benchmarks.synthetic_scene import (
+    SyntheticScene,
+    registered_images,
+    street,
+    synthetic_scene,
+)
 from mkpc_kaggle.geometry.cameras import relative_pose
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene import colmap

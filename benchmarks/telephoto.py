@@ -37,10 +37,14 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("train_dir", type=Path, help="of the demo set")
-    parser.add_argument("--out", type=Path, required=True, metavar="FIG.png", help="draw a pair")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FIG.png", help="draw a pair"
+    )
     arguments = parser.parse_args()
     # All pairs of the tables, also pairs that the competition would not score.
-    scenes = read_train_side(arguments.train_dir, scenes=["street", "market"], min_covisibility=0.0)
+    scenes = read_train_side(
+        arguments.train_dir, scenes=["street", "market"], min_covisibility=0.0
+    )
     known = {true.pair.id: (true, scene) for scene in scenes for true in scene.pairs}
 
     print(

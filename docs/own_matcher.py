@@ -7,7 +7,15 @@ import sys
 
 import cv2
 
-from mkpc_kaggle import Colour, MatcherSpec, Matches, PairwiseMatcher, Recipe, TwoStageMatcher, Unit
+from mkpc_kaggle import (
+    Colour,
+    MatcherSpec,
+    Matches,
+    PairwiseMatcher,
+    Recipe,
+    TwoStageMatcher,
+    Unit,
+)
 
 # Results are kept for later runs under the version: change it whenever equal pictures get other points. (For a
 # file in the package's `matchers/adapters/`, increase `POINTS_VERSION` of `engine/keys.py` instead.)

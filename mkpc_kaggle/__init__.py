@@ -16,7 +16,11 @@ if TYPE_CHECKING:
     from mkpc_kaggle.engine.frames import results
     from mkpc_kaggle.errors import UserError
     from mkpc_kaggle.geometry.coordinates import Box, Size
-    from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, critical_region
+    from mkpc_kaggle.geometry.critical_region import (
+        CriticalRegion,
+        MkpcConfig,
+        critical_region,
+    )
     from mkpc_kaggle.geometry.matches import Matches
     from mkpc_kaggle.geometry.robust import Estimate, ModelKind
     from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, PairwiseMatcher, Picture

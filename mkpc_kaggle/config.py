@@ -49,7 +49,9 @@ def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> No
         raise UserError(f"{where} must be a table, not {table!r}")
     for key in table:
         if key not in known:
-            raise UserError(f"{where} has the unknown key {key!r}; known keys: {', '.join(known)}")
+            raise UserError(
+                f"{where} has the unknown key {key!r}; known keys: {', '.join(known)}"
+            )
 
 
 def convert(value: Any, kind: type, where: str) -> Any:

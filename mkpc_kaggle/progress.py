@@ -20,7 +20,9 @@ def format_duration(seconds: float) -> str:
     if seconds < 60:
         return f"{seconds:.1f}s"
     minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes}m{rest:02d}s" if minutes < 60 else f"{minutes // 60}h{minutes % 60:02d}m"
+    return (
+        f"{minutes}m{rest:02d}s" if minutes < 60 else f"{minutes // 60}h{minutes % 60:02d}m"
+    )
 
 
 def parse_duration(text: str) -> float:
@@ -45,7 +47,9 @@ def counted(items: Sequence[Item], what: str, unit: str) -> Iterable[Item]:
     from tqdm import tqdm  # most commands do not need it
 
     interval = REDRAW_S if is_terminal(sys.stderr) else LINE_INTERVAL_S
-    return tqdm(items, what, unit=unit, delay=MAX_SILENCE_S, mininterval=interval, leave=False)
+    return tqdm(
+        items, what, unit=unit, delay=MAX_SILENCE_S, mininterval=interval, leave=False
+    )
 
 
 def print_to(stream: TextIO | None, text: str, end: str = "\n") -> None:

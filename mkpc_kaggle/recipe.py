@@ -102,9 +102,13 @@ class Unit:
         if bool(self.long_side) == bool(self.area):
             raise ValueError("either long_side or area must be given, and not both")
         if self.area and not AREA.fullmatch(self.area):
-            raise ValueError(f'area must be height x width such as "540x720", not {self.area!r}')
+            raise ValueError(
+                f'area must be height x width such as "540x720", not {self.area!r}'
+            )
         if self.stretch and not self.area:
-            raise ValueError("stretch needs an area, the height and width to stretch views to")
+            raise ValueError(
+                "stretch needs an area, the height and width to stretch views to"
+            )
         if self.area and not self.enlarge:
             raise ValueError("enlarge = false needs a long_side")
 
@@ -119,7 +123,9 @@ class Unit:
         height, width = map(int, (self.area or "1x1").split("x"))
         long_side = self.long_side if self.enlarge else min(self.long_side, max(crop.size))
         if self.stretch:
-            view = View.stretched(crop, size=Size(width, height), multiple=multiple, turns=turns)
+            view = View.stretched(
+                crop, size=Size(width, height), multiple=multiple, turns=turns
+            )
         else:
             view = View.fit(
                 crop, long_side=long_side, area=width * height, multiple=multiple, turns=turns
@@ -242,7 +248,9 @@ class Recipe:
         if not self.units:
             raise UserError(f"{where} has no units")
         if self.units[0].stage != 1:
-            raise UserError(f"{where}: the first unit sweeps all pairs, so it must have stage 1")
+            raise UserError(
+                f"{where}: the first unit sweeps all pairs, so it must have stage 1"
+            )
         names = [unit.name for unit in self.units]
         # The name is the unit's key in journals.
         for name in names:
@@ -302,7 +310,9 @@ def with_settings(recipe: Recipe, settings: Mapping[str, Any]) -> Recipe:
     table = recipe.table()
     for key, value in settings.items():
         if not isinstance(key, str):
-            raise UserError(f"settings: expected a key such as 'magsac.threshold', got {key!r}")
+            raise UserError(
+                f"settings: expected a key such as 'magsac.threshold', got {key!r}"
+            )
         *names, last = key.split(".")
         if not names or names[0] not in TABLES:
             known = ", ".join(TABLES)
@@ -323,7 +333,9 @@ def parse_setting(text: str) -> tuple[str, Any]:
     """Return the key and the value of ``TABLE.KEY=VALUE``; a value that is not TOML is a text."""
     key, separator, value = text.partition("=")
     if not separator:
-        raise UserError(f"--set {text}: expected TABLE.KEY=VALUE, such as magsac.threshold=0.3")
+        raise UserError(
+            f"--set {text}: expected TABLE.KEY=VALUE, such as magsac.threshold=0.3"
+        )
     try:
         parsed = tomllib.loads(f"value = {value}")
     except (ValueError, RecursionError):

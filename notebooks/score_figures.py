@@ -86,9 +86,14 @@ def draw_errors(validations: Sequence["Validation"]) -> "Figure":
         for index, validation in enumerate(validations):
             # Failures are infinite: clipped beyond the right edge, so that the curve ends below 1.
             errors = np.clip(
-                [getattr(error, kind) for error in validation.errors], limits[0], 2 * limits[1]
+                [getattr(error, kind) for error in validation.errors],
+                limits[0],
+                2 * limits[1],
             )
-            style = {"color": _style(index)["color"], "linestyle": DASHES[index % len(DASHES)]}
+            style = {
+                "color": _style(index)["color"],
+                "linestyle": DASHES[index % len(DASHES)],
+            }
             axes.ecdf(errors, **style, linewidth=2, label=validation.recipe)
         axes.set(xscale="log", xlim=limits, ylim=(0, 1.01), xlabel=f"{kind} error in {unit}")
         axes.xaxis.set_major_formatter("{x:g}")

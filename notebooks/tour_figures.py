@@ -13,7 +13,12 @@ from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Points
-from mkpc_kaggle.geometry.critical_region import Clusters, CriticalRegion, MkpcConfig, expand_box
+from mkpc_kaggle.geometry.critical_region import (
+    Clusters,
+    CriticalRegion,
+    MkpcConfig,
+    expand_box,
+)
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.geometry.robust import Estimate
@@ -39,7 +44,9 @@ def read_true_pair(directory: Path, pair: str) -> tuple[TrainScene, TruePair]:
 
     Raises :class:`UserError` for an unknown pair, and the errors of :func:`read_train_side`.
     """
-    (scene,) = read_train_side(directory, scenes=[pair.partition(";")[0]], min_covisibility=0.0)
+    (scene,) = read_train_side(
+        directory, scenes=[pair.partition(";")[0]], min_covisibility=0.0
+    )
     known = {true.pair.id: true for true in scene.pairs}
     if pair not in known:
         raise UserError(
@@ -66,7 +73,9 @@ def draw_stage(images: Images, match: PairMatch, stage: int) -> "Figure":
         if regions
         else [Box.whole(image.size) for image in images]
     )
-    figure, row = side_by_side([_cut(image, box) for image, box in zip(images, boxes, strict=True)])
+    figure, row = side_by_side(
+        [_cut(image, box) for image, box in zip(images, boxes, strict=True)]
+    )
     # The figure shows the crop alone, so the points move by its offset.
     shift0, shift1 = (np.array([box.left, box.top], np.float32) for box in boxes)
     found = match.matches[mask]
@@ -119,13 +128,18 @@ def _size_bars(axes: "Axes", clusters: Clusters, config: MkpcConfig) -> None:
         axes.set(xticks=[], yticks=[])
         return
     ranks = np.arange(1, len(sizes) + 1)
-    for part, colour, hatch in ((slice(kept), INLIER, ""), (slice(kept, None), OUTLIER, "//")):
+    for part, colour, hatch in (
+        (slice(kept), INLIER, ""),
+        (slice(kept, None), OUTLIER, "//"),
+    ):
         bars = axes.bar(
             ranks[part], sizes[part], color=colour, hatch=hatch, edgecolor="white", width=0.7
         )
         # More than ten labels of two lines would overlap.
         shares = [f"\n{size / sizes[0]:.3f}" if len(sizes) <= 10 else "" for size in sizes]
-        labels = [f"{size}{share}" for size, share in zip(sizes[part], shares[part], strict=True)]
+        labels = [
+            f"{size}{share}" for size, share in zip(sizes[part], shares[part], strict=True)
+        ]
         axes.bar_label(bars, labels, padding=3, fontsize=9, bbox=_PAPER)
     axes.axhline(config.share * sizes[0], color="black", linewidth=1.2, linestyle="--")
     # A logarithmic scale, because the largest cluster may have a hundred times the points of a
@@ -196,7 +210,9 @@ def draw_both(images: Images, match: PairMatch) -> "Figure":
         _crosses(axes, points[~inliers], DROPPED)
         for stage, marker in ((1, "o"), (2, "^")):
             xy = points[match.in_stage(stage) & inliers]
-            axes.scatter(xy[:, 0], xy[:, 1], s=9, c=COLOURS[stage - 1], marker=marker, linewidths=0)
+            axes.scatter(
+                xy[:, 0], xy[:, 1], s=9, c=COLOURS[stage - 1], marker=marker, linewidths=0
+            )
     counts = [
         f"{what}: stage {stage}, {np.count_nonzero(match.in_stage(stage))} points, "
         f"{np.count_nonzero(match.in_stage(stage) & inliers)} inliers"
@@ -269,7 +285,9 @@ def draw_pose_errors(errors: Mapping[str, PoseError]) -> "Figure":
             names, np.where(known, angles, 0), color=list(COLOURS[: len(names)]), height=0.6
         )
         # Significant digits: the errors of a pair may be thousandths of a degree.
-        labels = [f"{angle:.3g}" if ok else "no F" for angle, ok in zip(angles, known, strict=True)]
+        labels = [
+            f"{angle:.3g}" if ok else "no F" for angle, ok in zip(angles, known, strict=True)
+        ]
         axes.bar_label(bars, labels, padding=3)
         axes.margins(x=0.15)
         # With more ticks, the numbers of both panels would touch.
@@ -278,7 +296,9 @@ def draw_pose_errors(errors: Mapping[str, PoseError]) -> "Figure":
     return figure
 
 
-def side_by_side(images: Sequence[Image], title_lines: int = 1) -> "tuple[Figure, Sequence[Axes]]":
+def side_by_side(
+    images: Sequence[Image], title_lines: int = 1
+) -> "tuple[Figure, Sequence[Axes]]":
     """Show pictures in a row at one height, with room for titles of ``title_lines`` lines."""
     aspects = [image.size.width / image.size.height for image in images]
     height = min((WIDTH - 0.1 * (len(images) + 1)) / sum(aspects), 5.0)
@@ -300,7 +320,10 @@ def connect(axes: "Sequence[Axes]", matches: Matches, inliers: NDArray[np.bool_]
     outliers_drawn = sample(~inliers, MAX_OUTLIERS)
     inliers_drawn = sample(inliers, MAX_INLIERS)
     # Inliers last, so that they are on top.
-    for indices, colour, width in ((outliers_drawn, OUTLIER, 0.5), (inliers_drawn, INLIER, 0.7)):
+    for indices, colour, width in (
+        (outliers_drawn, OUTLIER, 0.5),
+        (inliers_drawn, INLIER, 0.7),
+    ):
         for panel, points in zip(axes, (matches.points0, matches.points1), strict=True):
             panel.scatter(points[indices, 0], points[indices, 1], s=6, c=colour, linewidths=0)
         for index in indices:
@@ -430,7 +453,9 @@ def _upright_axes(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     return np.stack([np.cross(ahead, up), up, ahead])
 
 
-def _draw_projected(panel: "Axes", name: str, model: SfmModel, axes: NDArray[np.float64]) -> None:
+def _draw_projected(
+    panel: "Axes", name: str, model: SfmModel, axes: NDArray[np.float64]
+) -> None:
     """Draw a model's cameras and points as seen from ``name``, projected on ``axes`` (3, 2)."""
     cameras = [found.camera for found in model.images]
     plain_axes(panel, f"{plural(len(cameras), 'camera')} from {name}")

@@ -22,7 +22,9 @@ def texts_of(source: str) -> Iterator[str]:
     """The texts of a program, with {} for inserted values; adjoining texts are joined."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.JoinedStr):
-            parts = [part.value if isinstance(part, ast.Constant) else "{}" for part in node.values]
+            parts = [
+                part.value if isinstance(part, ast.Constant) else "{}" for part in node.values
+            ]
             yield "".join(map(str, parts))
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             yield node.value
@@ -89,7 +91,14 @@ def test_pages_name_only_commands_and_options_that_exist(page):
 
 # Options of other programs that pages name: pip, kaggle, ray, accelerators of Kaggle, COLMAP, nerfstudio.
 OTHERS = {"--no-deps", "--follow", "--head", "--accelerator"}
-OTHERS |= {"--colmap-path", "--data", "--database", "--downscale-factor", "--image", "--import"}
+OTHERS |= {
+    "--colmap-path",
+    "--data",
+    "--database",
+    "--downscale-factor",
+    "--image",
+    "--import",
+}
 OTHERS |= {"--result"}
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
 
@@ -110,7 +119,9 @@ def test_every_option_is_in_the_pages_and_every_option_of_the_pages_exists():
     known = all_options()
     assert len(known) > 20
     assert sorted(known - named) == [], "options that no page names"
-    measured = "\n".join(path.read_text("utf-8") for path in (ROOT / "benchmarks").rglob("*.py"))
+    measured = "\n".join(
+        path.read_text("utf-8") for path in (ROOT / "benchmarks").rglob("*.py")
+    )
     benchmarks = set(OPTION.findall(measured))
     assert sorted(named - known - benchmarks - OTHERS) == [], "options that do not exist"
 
@@ -193,4 +204,6 @@ def test_no_error_of_any_type_is_dropped():
     # Such a block turns a limit of a library into "no information".
     dropped = re.compile(r"suppress\((Base)?Exception\b|except( (Base)?Exception)?:\s+pass\b")
     files = sorted((ROOT / "mkpc_kaggle").rglob("*.py"))
-    assert [str(path) for path in files if dropped.search(path.read_text(encoding="utf-8"))] == []
+    assert [
+        str(path) for path in files if dropped.search(path.read_text(encoding="utf-8"))
+    ] == []

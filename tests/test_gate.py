@@ -38,7 +38,9 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return 0
 
 
-def test_a_ratio_above_its_tolerance_comes_first_and_ends_with_1(baseline, monkeypatch, capsys):
+def test_a_ratio_above_its_tolerance_comes_first_and_ends_with_1(
+    baseline, monkeypatch, capsys
+):
     known = {name: {"ratio": 1.0, "tolerance": 0.1} for name in RATIOS}
     baseline.write_text(json.dumps({"machine": "another", "ratios": known}))
     assert run(monkeypatch) == 1

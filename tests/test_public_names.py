@@ -54,5 +54,7 @@ def test_every_public_name_exists_and_is_listed_for_completion():
 
 def test_the_import_of_the_package_loads_no_library():
     code = "import mkpc_kaggle, sys; print(*{'torch', 'numpy', 'cv2', 'pandas'} & {*sys.modules})"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert done.stdout.split() == []

@@ -8,7 +8,9 @@ import pytest
 from genuine import GENUINE
 from pictures import write_two_views
 
-PAGE = (Path(__file__).resolve().parents[1] / "docs" / "python.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).resolve().parents[1] / "docs" / "python.md").read_text(
+    encoding="utf-8"
+)
 BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE, re.M | re.S)
 GENUINE_BLOCKS = [block for block in BLOCKS if 'weights="weights"' in block]
 OURS = [block for block in BLOCKS if block not in GENUINE_BLOCKS]
@@ -40,7 +42,9 @@ def test_the_page_runs_from_top_to_bottom(names, tmp_path):
 
 
 @pytest.mark.genuine
-def test_our_lines_for_users_of_lightglue_run_with_genuine_weights(names, tmp_path, monkeypatch):
+def test_our_lines_for_users_of_lightglue_run_with_genuine_weights(
+    names, tmp_path, monkeypatch
+):
     monkeypatch.delenv("MKPC_WEIGHTS", raising=False)
     (tmp_path / "weights").symlink_to(GENUINE)
     assert len(GENUINE_BLOCKS) == 1

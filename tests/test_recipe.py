@@ -44,7 +44,9 @@ def test_a_recipe_of_the_package_loads_with_options_for_every_matcher(name):
     assert set(recipe.matchers) <= set(recipe.matcher_names)
     for mode in Mode:
         assert recipe.in_mode(mode).units[0] == recipe.units[0]
-        assert mode is Mode.TWO_STAGE or {unit.stage for unit in recipe.in_mode(mode).units} == {1}
+        assert mode is Mode.TWO_STAGE or {
+            unit.stage for unit in recipe.in_mode(mode).units
+        } == {1}
     # The paper's recipes estimate as the paper does; ours have a prior.
     assert (recipe.focal is None) == name.startswith("imc2022")
 
@@ -65,7 +67,9 @@ def test_any_remaining_matchers_of_recipe_auto_begin_with_a_unit_of_stage_1():
 def test_recipes_with_weights_for_noncommercial_use_are_those_that_the_readme_names(name):
     recipe = load_recipe(name)
     licences = {file.slot: file.licence for file in manifest()}
-    bound = ["noncommercial" in licences[slot] for slot in slots_of(recipe, recipe.matcher_names)]
+    bound = [
+        "noncommercial" in licences[slot] for slot in slots_of(recipe, recipe.matcher_names)
+    ]
     assert any(bound) == name.startswith(("imc2022", "auto", "best"))
 
 
@@ -96,7 +100,9 @@ def test_a_unit_shows_a_crop_at_its_size():
     assert Unit(1, "a", 640, enlarge=False).view(crop, 32, turns=1) == native
     shrunk = Unit(1, "a", 150, enlarge=False)
     assert shrunk.view(crop, 32) == replace(shrunk, enlarge=True).view(crop, 32)
-    assert Unit(1, "a", area="54x72").view(crop, 8) == View.fit(crop, area=54 * 72, multiple=8)
+    assert Unit(1, "a", area="54x72").view(crop, 8) == View.fit(
+        crop, area=54 * 72, multiple=8
+    )
     assert Unit(1, "a", area="54x72", stretch=True).view(crop, 1).content == Size(72, 54)
 
 
@@ -118,7 +124,10 @@ def unit(**changes):
             r"unit 1.*'longside'.*stage, matcher, long_side, max_matches, area",
         ),
         # A mistyped key would otherwise leave the default in use, unseen.
-        (SIFT + "[mkpc]\nepsilon = 1\n", r"\[mkpc\].*'epsilon'.*eps, min_samples, share, expand_x"),
+        (
+            SIFT + "[mkpc]\nepsilon = 1\n",
+            r"\[mkpc\].*'epsilon'.*eps, min_samples, share, expand_x",
+        ),
         ("", "no units"),
         ("units = [", "not valid TOML"),
         (
@@ -145,7 +154,10 @@ def unit(**changes):
             )
             for area in ("540x0", "540 x 720")
         ],
-        (SIFT + "[mkpc]\neps = nan\n", r"table \[mkpc\]: .*eps must be in \[1e-06, inf\), not nan"),
+        (
+            SIFT + "[mkpc]\neps = nan\n",
+            r"table \[mkpc\]: .*eps must be in \[1e-06, inf\), not nan",
+        ),
         (SIFT + "[magsac]\nthreshold = 0\n", r"threshold must be in \(0, inf\), not 0"),
     ],
 )

@@ -18,7 +18,9 @@ def names_in(tree: ast.Module) -> tuple[set[str], set[str]]:
     for node in tree.body:
         if isinstance(node, ast.FunctionDef):
             others.add(node.name)
-        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        targets = (
+            node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        )
         for target in targets:
             if isinstance(target, ast.Name) and not is_type_variable(node):
                 # A type alias is in capitals like a class.
@@ -29,7 +31,10 @@ def names_in(tree: ast.Module) -> tuple[set[str], set[str]]:
 
 def is_type_variable(node: ast.stmt) -> bool:
     call = getattr(node, "value", None)
-    return isinstance(call, ast.Call) and getattr(call.func, "id", "") in ("TypeVar", "ParamSpec")
+    return isinstance(call, ast.Call) and getattr(call.func, "id", "") in (
+        "TypeVar",
+        "ParamSpec",
+    )
 
 
 def modules() -> dict[Path, ast.Module]:
@@ -52,7 +57,9 @@ def test_no_function_and_no_constant_that_is_imported_elsewhere_is_defined_twice
     imported = set()
     for tree in trees.values():
         for node in ast.walk(tree):
-            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("mkpc_kaggle"):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith(
+                "mkpc_kaggle"
+            ):
                 imported |= {name.name for name in node.names}
     defined = defaultdict(set)
     for path, tree in trees.items():

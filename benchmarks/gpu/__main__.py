@@ -65,7 +65,9 @@ def _run(setup: Setup, arguments: argparse.Namespace) -> int:
     surprises = sum(len(part.surprises) for part in parts.values())
     failed = [part.name for part in parts.values() if part.status is Status.FAILED]
     say(f"{time.monotonic() - start:.0f} s; {arguments.out / 'gpu.json'}")
-    say(f"rows not as expected: {surprises}; parts that failed: {', '.join(failed) or 'none'}")
+    say(
+        f"rows not as expected: {surprises}; parts that failed: {', '.join(failed) or 'none'}"
+    )
     return int(bool(surprises or failed))
 
 
@@ -79,7 +81,14 @@ def _parser() -> argparse.ArgumentParser:
     add("--out", type=Path, required=True, metavar="DIR", help="for gpu.json")
     add("--device", default="cuda:0", help="cuda:0 (the default), cuda:N or cpu")
     add("--quick", action="store_true", help="a rehearsal on small images, in under a minute")
-    add("--weights", action="append", default=[], type=Path, metavar="DIR", help="trained weights")
+    add(
+        "--weights",
+        action="append",
+        default=[],
+        type=Path,
+        metavar="DIR",
+        help="trained weights",
+    )
     names = ", ".join(name for name, *_ in PARTS)
     add("--only", default="", metavar="PARTS", help=f"only these parts, by commas: {names}")
     return parser

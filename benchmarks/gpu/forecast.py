@@ -33,7 +33,9 @@ def measure(part: Part, setup: Setup, speed: Part) -> None:
                 if cost is not None:
                     seconds.append(_seconds(unit, cost))
             part.add(
-                recipe=recipe_name, precision=precision, **_forecast(seconds, len(recipe.units))
+                recipe=recipe_name,
+                precision=precision,
+                **_forecast(seconds, len(recipe.units)),
             )
 
 

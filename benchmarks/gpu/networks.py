@@ -147,14 +147,18 @@ def _points(
         numbers = range(start, min(count, start + at_a_time))
         sides = []
         for shift in (SHIFT, 0):
-            sides.append([_picture(colour, number, shift, noise, setup) for number in numbers])
+            sides.append(
+                [_picture(colour, number, shift, noise, setup) for number in numbers]
+            )
         with exact_float32():
             encodings = [matcher.encode(pictures) for pictures in sides]
             if isinstance(matcher, DenseMatcher):
                 points += [_warp(matcher, *both) for both in zip(*encodings, strict=True)]
                 continue
             found = matcher.match(*encodings)
-        points += [torch.from_numpy(np.hstack([each.points0, each.points1])) for each in found]
+        points += [
+            torch.from_numpy(np.hstack([each.points0, each.points1])) for each in found
+        ]
     return points
 
 

@@ -91,7 +91,9 @@ class Case:
     fault: Fault = Fault.NONE
     places: int = 1
     is_killed: bool = False  # the worker of matching, after its first matches
-    seconds: float = 30.0  # that it needs on an H100: each start of a worker takes five or more
+    seconds: float = (
+        30.0  # that it needs on an H100: each start of a worker takes five or more
+    )
 
 
 def undisturbed(outcome: Outcome) -> list[str]:
@@ -187,7 +189,9 @@ def _recipe(setup: Setup) -> Path:
     """Write the recipe of the runs: ALIKED + LightGlue on whole images and on crops."""
     side = QUICK_SIDE if setup.quick else LONG_SIDE
     features = QUICK_FEATURES if setup.quick else FEATURES
-    units = [f'{{ stage = {n}, matcher = "aliked_lightglue", long_side = {side} }}' for n in (1, 2)]
+    units = [
+        f'{{ stage = {n}, matcher = "aliked_lightglue", long_side = {side} }}' for n in (1, 2)
+    ]
     text = f"units = [{', '.join(units)}]\n[magsac]\nmax_iterations = 5000\n"
     path = setup.out / "runs.toml"
     path.write_text(f"{text}[matchers.aliked_lightglue]\nfeatures = {features}\n")
@@ -209,11 +213,21 @@ def _run(case: Case, recipe: Path, setup: Setup, seconds: float, limit: int) -> 
     for directory in setup.weights:
         words += ["--weights", directory]
     layers = 0 if is_trained else QUICK_LAYERS if setup.quick else LAYERS
-    command = [sys.executable, "-m", "benchmarks.gpu.submit_with", case.fault, home, limit, layers]
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.gpu.submit_with",
+        case.fault,
+        home,
+        limit,
+        layers,
+    ]
     start = time.monotonic()
     with (home / "log.txt").open("w") as log:
         process = subprocess.Popen(
-            [*map(str, command), "submit", *map(str, words)], stdout=log, stderr=subprocess.STDOUT
+            [*map(str, command), "submit", *map(str, words)],
+            stdout=log,
+            stderr=subprocess.STDOUT,
         )
         try:
             if case.is_killed:
@@ -271,7 +285,9 @@ def _memory_limit(outcome: Outcome) -> int:
     loaded = max(
         (event["memory"] for event in outcome.events if event["call"] == "loaded"), default=0
     )
-    most = max((event["count"] for event in outcome.events if event["call"] == "encode"), default=0)
+    most = max(
+        (event["count"] for event in outcome.events if event["call"] == "encode"), default=0
+    )
     peaks = [
         event["memory"]
         for event in outcome.events

@@ -33,7 +33,9 @@ class Setup:
         """Return the demo set, rendered on first use: one scene for a rehearsal, else all."""
         directory = self.out / "demo"
         if (directory / "test" / "test.csv").is_file():
-            return DemoSet(directory / "train", directory / "test", directory / "test_truth.csv")
+            return DemoSet(
+                directory / "train", directory / "test", directory / "test_truth.csv"
+            )
         if self.quick:
             return write_demo(directory, scenes=["courtyard"], image_scale=QUICK_SCALE)
         return write_demo(directory, scenes=["courtyard", "market"])

@@ -92,7 +92,9 @@ def measure(part: Part, setup: Setup) -> None:
                 placement = Placement(setup.device, precision)
                 options = _options(case, setup)
                 row.update(
-                    _seconds(load_matcher(case.matcher, weights, options, placement), case, setup)
+                    _seconds(
+                        load_matcher(case.matcher, weights, options, placement), case, setup
+                    )
                 )
             _free(setup)
 
@@ -170,10 +172,14 @@ def _pairs(count: int, name: str) -> list[PairMatch]:
 
 @cache
 def _photograph() -> Any:
-    return cv2.resize(load_sample_images().images[0], PHOTOGRAPH, interpolation=cv2.INTER_CUBIC)
+    return cv2.resize(
+        load_sample_images().images[0], PHOTOGRAPH, interpolation=cv2.INTER_CUBIC
+    )
 
 
-def _matched(pipeline: Pipeline, unit: Unit, pairs: list[PairMatch], setup: Setup) -> list[Any]:
+def _matched(
+    pipeline: Pipeline, unit: Unit, pairs: list[PairMatch], setup: Setup
+) -> list[Any]:
     """Return the unit's result on each pair. Raise the first failure."""
     results = [pair.results[0] for pair in pipeline.match(pairs, [unit])]
     setup.synchronise()

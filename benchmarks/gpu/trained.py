@@ -38,14 +38,17 @@ def measure(part: Part, setup: Setup) -> None:
         raise SkippedError(f"no trained weights of {', '.join(missing)}; {where}")
     unit = Unit(1, NAME, QUICK_SIDE if setup.quick else LONG_SIDE)
     count = QUICK_PAIRS if setup.quick else PAIRS
-    pairs = [_images(*pair.images) for pair in islice(read_test_side(setup.demo().test_dir), count)]
+    pairs = [
+        _images(*pair.images) for pair in islice(read_test_side(setup.demo().test_dir), count)
+    ]
     on_cpu = _points(weights, unit, pairs, Placement())
     for precision in Precision:
         part.check_time()
         with part.row(precision=str(precision)) as row:
             found = _points(weights, unit, pairs, Placement(setup.device, precision))
             shares = [
-                agreement(*both, SAME_PX, torch.inf) for both in zip(found, on_cpu, strict=True)
+                agreement(*both, SAME_PX, torch.inf)
+                for both in zip(found, on_cpu, strict=True)
             ]
             row["pairs"] = len(pairs)
             row["matches"] = sum(map(len, found))

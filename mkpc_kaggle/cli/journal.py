@@ -15,7 +15,9 @@ Exit status: 0 done, 2 the journal does not exist.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("work_dir", type=Path, metavar="DIR", help="work directory of the run")
+    parser.add_argument(
+        "work_dir", type=Path, metavar="DIR", help="work directory of the run"
+    )
 
 
 def run(arguments: argparse.Namespace) -> None:

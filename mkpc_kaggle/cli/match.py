@@ -25,7 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("image0", type=Path, help="first image")
     parser.add_argument("image1", type=Path, help="second image")
     parser.add_argument(
-        "--out", type=Path, metavar="FIG.png", help="draw the pair; the suffix sets the format"
+        "--out",
+        type=Path,
+        metavar="FIG.png",
+        help="draw the pair; the suffix sets the format",
     )
     options.add_matching(parser)
 

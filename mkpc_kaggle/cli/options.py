@@ -64,9 +64,7 @@ def recipe_file(arguments: argparse.Namespace) -> Path | None:
 
 def add_weights(parser: argparse.ArgumentParser) -> None:
     """Add ``--weights``."""
-    text = (
-        "directory of weight files; may be repeated. Also searched: $MKPC_WEIGHTS and /kaggle/input"
-    )
+    text = "directory of weight files; may be repeated. Also searched: $MKPC_WEIGHTS and /kaggle/input"
     parser.add_argument(
         "--weights", action="append", default=[], type=Path, metavar="DIR", help=text
     )
@@ -120,7 +118,9 @@ def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
     text = f"""limit from the start of the program, such as 8h45m, 90m or 60s; the run ends before it, with the
         units that fit (default: {time_limit or "none"})"""
     add("--time-limit", default=time_limit, metavar="TIME", help=text)
-    text = "count the limit from this time, in seconds since 1970: time.time(), or $(date +%%s)"
+    text = (
+        "count the limit from this time, in seconds since 1970: time.time(), or $(date +%%s)"
+    )
     add("--started-at", type=float, metavar="SECONDS", help=text)
     text = """number of worker processes (default: one per GPU, or one for the CPU); 0: compute in this process.
         ray: use the Ray cluster of this machine, one worker per GPU, or per machine without GPUs; HOST:PORT as
@@ -144,7 +144,9 @@ def settings_of(arguments: argparse.Namespace) -> dict[str, Any]:
     return dict(map(parse_setting, arguments.set))
 
 
-def assembly_of(arguments: argparse.Namespace, interrupt: Interrupt, recipe: str = "") -> Assembly:
+def assembly_of(
+    arguments: argparse.Namespace, interrupt: Interrupt, recipe: str = ""
+) -> Assembly:
     """Return the assembly of a recipe, by default the command's, with the command's options."""
     name, mode = split_mode(recipe or arguments.recipe)
     with interrupt.raising():  # computing the digests of large files takes long

@@ -19,7 +19,13 @@ Weights whose licences do not allow redistribution are left out, unless --privat
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--out", type=Path, required=True, metavar="DIR", help="the directory for the two folders")
+    add(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="the directory for the two folders",
+    )
     add("--owner", required=True, metavar="NAME", help="your user name on Kaggle")
     options.add_weights(parser)
     add(
@@ -29,7 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="Python version of the wheels (default: %(default)s)",
     )
     add("--wheels", type=Path, metavar="DIR", help="take wheels from DIR, without a network")
-    text = "include weights that must not be redistributed; the dataset must then stay private"
+    text = (
+        "include weights that must not be redistributed; the dataset must then stay private"
+    )
     add("--private", action="store_true", help=text)
 
 
@@ -58,9 +66,7 @@ def run(arguments: argparse.Namespace) -> None:
     print(_NEXT.format(out=out))
 
 
-_LEFT_OUT = (
-    "Left out, because their licences do not clearly allow redistribution (--private includes them)"
-)
+_LEFT_OUT = "Left out, because their licences do not clearly allow redistribution (--private includes them)"
 _PRIVATE = """\
 Included, although their licences do not clearly allow redistribution. Keep the dataset private on Kaggle, do not
 share it, and check what the licences say about competitions"""

@@ -57,7 +57,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--intrinsics", type=Path, metavar="FILE.csv", help=text)
     text = "masks named as COLMAP's, MASKS/a.jpg.png for a.jpg; points on black pixels are left out"
     add("--masks", type=Path, metavar="MASKS", help=text)
-    add("--fresh", action="store_true", help="delete the journal of an earlier run in OUT/work")
+    add(
+        "--fresh",
+        action="store_true",
+        help="delete the journal of an earlier run in OUT/work",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

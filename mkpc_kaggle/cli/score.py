@@ -17,7 +17,13 @@ errors of 0.2 to 5 metres.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("submissions", nargs="+", type=Path, metavar="SUBMISSION.csv", help="files to score")
-    add("--train-dir", type=Path, required=True, metavar="DIR", help="the train side, with poses")
+    add(
+        "--train-dir",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="the train side, with poses",
+    )
     text = "the pairs of the samples; `demo` writes an example"
     add("--truth", type=Path, required=True, metavar="CSV", help=text)
     options.add_train_side(parser)

@@ -71,19 +71,18 @@ def run(arguments: argparse.Namespace) -> int:
         first_version(pairs, output, work_dir)
         with options.watched_session(arguments, work_dir, interrupt) as session:
             assembly = options.assembly_of(arguments, interrupt)
-            recipe = assembly.recipe
-            about = f"{plural(len(pairs), 'pair')}, recipe {recipe.name}, {assembly.placement}"
+            about = f"{plural(len(pairs), 'pair')}, recipe {assembly.recipe.name}, {assembly.placement}"
             lines = [
                 f"{about}, journal in {work_dir}",
-                left_out_line(recipe, assembly.left_out),
+                left_out_line(assembly.recipe, assembly.left_out),
                 missing_line(pairs),
             ]
             logger.info("\n".join(filter(None, lines)))
             _, images = test_side(arguments.test_dir)
             report = submit(pairs, assembly, session, output, str(images))
             unwritten = report.about.unwritten
-            unsaved = report.about.unsaved
-            session.status = int(bool(unwritten or unsaved or trouble(report)))
+            failed = unwritten or report.about.unsaved or trouble(report)
+            session.status = int(bool(failed))
             reason = f" is not the last version: {unwritten}" if unwritten else ""
             # A file that could not be replaced is an earlier version; it is complete, too.
             # Before the report: drawing may exceed the time limit.

@@ -83,7 +83,9 @@ def run(arguments: argparse.Namespace) -> int:
             session.status = max(status, session.status)
             status = options.finish(session, page, pairs)
             # A comparison of unequal pairs would mean nothing.
-            if arguments.compare and not (validation.report and validation.report.ending.is_done):
+            if arguments.compare and not (
+                validation.report and validation.report.ending.is_done
+            ):
                 logger.info(
                     "nothing is compared until all is done; with a --work-dir, the same command resumes"
                 )

@@ -42,9 +42,14 @@ class Pair:
 
     id: str  # unique in a run
     group: str  # its batch or scene
-    file0: str  # paths of the images; text saves memory, since a table may have a million rows
+    file0: (
+        str  # paths of the images; text saves memory, since a table may have a million rows
+    )
     file1: str
-    turns: tuple[int, int] = (0, 0)  # counter-clockwise quarter turns of each image before matching
+    turns: tuple[int, int] = (
+        0,
+        0,
+    )  # counter-clockwise quarter turns of each image before matching
 
     @property
     def images(self) -> tuple[Path, Path]:
@@ -216,10 +221,14 @@ def _read_scene(
         if first not in cameras or second not in cameras:
             raise UserError(f"{where}: the pair {key!r} is not two images of calibration.csv")
         if covisibility >= min_covisibility:
-            pair = Pair(f"{directory.name};{key}", directory.name, images(first), images(second))
+            pair = Pair(
+                f"{directory.name};{key}", directory.name, images(first), images(second)
+            )
             pairs.append(TruePair(pair, cameras[first], cameras[second], covisibility))
     if not pairs:
-        raise UserError(f"{path} has no pair with a covisibility of at least {min_covisibility:g}")
+        raise UserError(
+            f"{path} has no pair with a covisibility of at least {min_covisibility:g}"
+        )
     return TrainScene(directory.name, metres, tuple(evenly_spread(pairs, most)))
 
 
@@ -276,7 +285,9 @@ def read_rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, list[st
             header = table.fieldnames or ()
             if missing := [column for column in columns if column not in header]:
                 found = ", ".join(header)[:200] or "none"
-                raise UserError(f"{path}: missing columns {', '.join(missing)}; it has {found}")
+                raise UserError(
+                    f"{path}: missing columns {', '.join(missing)}; it has {found}"
+                )
             for row in table:
                 where = f"{path}, line {table.line_num}"
                 # As the reader stands for cells beyond the header, and for missing ones

@@ -32,7 +32,19 @@ FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "AVIF", "JPEG2000", "PPM")
 # Files that are read as photographs, by suffix; the first three also stand for the competitions'
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 MORE_SUFFIXES = (
-    *(".jpe", ".jfif", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".pnm", ".jp2", ".avif"),
+    *(
+        ".jpe",
+        ".jfif",
+        ".webp",
+        ".tif",
+        ".tiff",
+        ".bmp",
+        ".ppm",
+        ".pgm",
+        ".pnm",
+        ".jp2",
+        ".avif",
+    ),
 )
 READ_SUFFIXES = IMAGE_SUFFIXES + MORE_SUFFIXES
 
@@ -50,7 +62,12 @@ PLANE_UNIT = 0xA210
 RECORDED_SIDES = 0xA002, 0xA003  # width and height in pixels when the photograph was taken
 FOCAL_35MM = 0xA405
 FILM_MM = 43.27  # diagonal of 35 mm film
-UNITS_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # inch, cm, mm, micrometre
+UNITS_MM: dict[float, float] = {
+    2: 25.4,
+    3: 10.0,
+    4: 1.0,
+    5: 0.001,
+}  # inch, cm, mm, micrometre
 # In long sides of the image; a focal length outside this range counts as unknown.
 EXIF_FOCALS = Range(0.2, 20.0)
 # Ratio of the shapes of a stored and a recorded picture; more is a crop, and not rounding.
@@ -156,7 +173,9 @@ def read_image(path: Path) -> Image | Unreadable:
     except PIL.UnidentifiedImageError:
         return Unreadable(name, _unknown(data))
     except Exception as error:  # a reader may raise anything for a damaged file
-        return Unreadable(name, f"cannot be read: {getattr(error, 'strerror', None) or error}")
+        return Unreadable(
+            name, f"cannot be read: {getattr(error, 'strerror', None) or error}"
+        )
     turns, focal = exif_facts(tags, size)
     return Image(name, pixels, BLAKE2(data).hexdigest(), focal, turns)
 
@@ -175,7 +194,9 @@ def _unknown(data: bytes) -> str:
     if not data:
         return "the file is empty"
     if data[:4] in (b"II*\0", b"MM\0*"):
-        return "a TIFF file of another kind than 1, 3 or 4 channels of 8 or 16 bits; convert it"
+        return (
+            "a TIFF file of another kind than 1, 3 or 4 channels of 8 or 16 bits; convert it"
+        )
     return "not a picture of a known format; convert it to JPEG or PNG"
 
 
@@ -194,7 +215,9 @@ def rgb_pixels(picture: PIL.Image.Image) -> Pixels:
     if picture.mode.startswith(("I", "F")):
         values = np.asarray(picture)
         if picture.mode == "F" or values.min() < 0 or values.max() > 0xFFFF:
-            raise ValueError("values of more than 16 bits; save it with 8 or 16 bits per value")
+            raise ValueError(
+                "values of more than 16 bits; save it with 8 or 16 bits per value"
+            )
         gray = (values.astype(np.uint16) >> 8).astype(np.uint8)
         return np.stack([gray] * 3, axis=2)
     return np.asarray(picture if picture.mode == "RGB" else picture.convert("RGB"))

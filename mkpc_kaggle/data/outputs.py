@@ -56,7 +56,9 @@ def require_apart(
 
 def weights_of_environment() -> list[Path]:
     """Return the directories in ``$MKPC_WEIGHTS``."""
-    return [Path(name) for name in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if name]
+    return [
+        Path(name) for name in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if name
+    ]
 
 
 def lies_in(path: Path, directory: Path) -> bool:

@@ -31,7 +31,11 @@ class SizedCamera(Camera):
 
 
 def look_at(
-    position: ArrayLike, target: ArrayLike, focal: float, size: tuple[int, int], roll: float = 0.0
+    position: ArrayLike,
+    target: ArrayLike,
+    focal: float,
+    size: tuple[int, int],
+    roll: float = 0.0,
 ) -> SizedCamera:
     """Return a camera at `position` that has `target` at the centre of its image.
 
@@ -88,7 +92,10 @@ def transfer(
 
 
 def visible_mask(
-    first: SizedCamera, first_nearness: FloatImage, second: SizedCamera, second_nearness: FloatImage
+    first: SizedCamera,
+    first_nearness: FloatImage,
+    second: SizedCamera,
+    second_nearness: FloatImage,
 ) -> NDArray[np.bool_]:
     """Return where `second` shows the same points, for the pixels of `transfer`: bool (h, w).
 
@@ -103,7 +110,10 @@ def visible_mask(
 
 
 def covisibility(
-    first: SizedCamera, first_nearness: FloatImage, second: SizedCamera, second_nearness: FloatImage
+    first: SizedCamera,
+    first_nearness: FloatImage,
+    second: SizedCamera,
+    second_nearness: FloatImage,
 ) -> float:
     """Return the smaller fraction of one view visible in the other, in [0, 1], in any order."""
     shared_by_first = visible_mask(first, first_nearness, second, second_nearness)

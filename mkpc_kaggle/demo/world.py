@@ -77,7 +77,9 @@ TELEPHOTO = (
 SCENES = {"courtyard": SHOTS, "market": SHOTS, "street": TELEPHOTO}
 
 
-def build_world(name: str, *, image_scale: float = 1.0) -> tuple[list[Surface], list[SizedCamera]]:
+def build_world(
+    name: str, *, image_scale: float = 1.0
+) -> tuple[list[Surface], list[SizedCamera]]:
     """Return the surfaces and cameras of a world, in metres.
 
     Only the name decides its content.
@@ -114,7 +116,9 @@ def _surfaces(rng: np.random.Generator) -> list[Surface]:
     return surfaces
 
 
-def facade(rng: np.random.Generator, corner: Point, right: Point, colour: ArrayLike) -> Surface:
+def facade(
+    rng: np.random.Generator, corner: Point, right: Point, colour: ArrayLike
+) -> Surface:
     """Return a stone wall on the ground, with a grid of windows that differ only in brightness."""
     width_m = hypot(*right)
     height_m = corner[2]
@@ -200,7 +204,9 @@ def paint(
     centres = rng.uniform((0, 0), (width, height), (count, 2))
     angles = rng.uniform(0, 180, count)
     # They differ mostly in brightness and a little in hue.
-    shades = 1 + rng.normal(0, contrast, (count, 1)) + rng.normal(0, 0.2 * contrast, (count, 3))
+    shades = (
+        1 + rng.normal(0, contrast, (count, 1)) + rng.normal(0, 0.2 * contrast, (count, 3))
+    )
     tones = (np.array(colour) * shades).clip(8, 250).tolist()
     for centre, side, angle, tone in zip(centres, sides, angles, tones, strict=True):
         if leaves is STONE:

@@ -75,7 +75,9 @@ def write_demo(
     samples, truths = zip(*rows, strict=True)
     factors = (f"{scene},{METRES_PER_UNIT}" for scene in scenes)
     _write_rows(demo.train_dir / "scaling_factors.csv", "scene,scaling_factor", factors)
-    _write_rows(demo.test_dir / "test.csv", "sample_id,batch_id,image_1_id,image_2_id", samples)
+    _write_rows(
+        demo.test_dir / "test.csv", "sample_id,batch_id,image_1_id,image_2_id", samples
+    )
     _write_rows(demo.truth_csv, "sample_id,scene,image_1_id,image_2_id", truths)
     return demo
 

@@ -164,7 +164,11 @@ class Costs:
 
 def start_limit(budget: Budget, since: float, *, loads_matchers: bool) -> float:
     """Return the seconds after ``since`` within which a worker must have started."""
-    return START_S if loads_matchers else min(START_S, max(budget.silence, unknown(budget, since)))
+    return (
+        START_S
+        if loads_matchers
+        else min(START_S, max(budget.silence, unknown(budget, since)))
+    )
 
 
 def unknown(budget: Budget, since: float) -> float:

@@ -27,8 +27,18 @@ if TYPE_CHECKING:
 
 NOT_REACHED = "not reached in time"
 TOO_FEW = "at least three matched images are needed"
-ELEMENTS = [f"f{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)]  # of F, row by row
-SCENE_COLUMNS = ["batch", "images", "cameras", "models", "points", "reprojection_error", "seconds"]
+ELEMENTS = [
+    f"f{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)
+]  # of F, row by row
+SCENE_COLUMNS = [
+    "batch",
+    "images",
+    "cameras",
+    "models",
+    "points",
+    "reprojection_error",
+    "seconds",
+]
 SCENE_COLUMNS += ["candidate", "failure", "missing"]
 
 # The store unites two databases by views. So its tables are not joined: SQLite would copy one of them.
@@ -93,13 +103,21 @@ class Results:
                 row: Any = known.loc[pair]
                 used = self.units[self.units["pair"] == pair]
                 columns = "key, data, regions"
-                stored = {key: more for key, *more in store.select("points", columns, used["key"])}
+                stored = {
+                    key: more for key, *more in store.select("points", columns, used["key"])
+                }
                 rows = []
                 for unit in used.to_dict("records"):
                     data, regions = stored.get(unit["key"], (None, ""))
                     # Points that the pair does not need are not used.
-                    rows.append((units[unit["unit"]], data if unit["is_needed"] else None, regions))
-                F = FALLBACK_FUNDAMENTAL if row["own"] is None else np.reshape(row["own"], (3, 3))
+                    rows.append(
+                        (units[unit["unit"]], data if unit["is_needed"] else None, regions)
+                    )
+                F = (
+                    FALLBACK_FUNDAMENTAL
+                    if row["own"] is None
+                    else np.reshape(row["own"], (3, 3))
+                )
                 yield PairMatch.of_stored(rows, F, row["inliers"], row["failure"])
 
 
@@ -140,7 +158,9 @@ def results_of(store: Store) -> Results:
     row = store.db.execute("SELECT about FROM run").fetchone()
     # A store that was opened, and then ended by a signal before the first publication
     if row is None:
-        raise UserError(f"{store.directory}: the run has not begun, or was stopped at its start")
+        raise UserError(
+            f"{store.directory}: the run has not begun, or was stopped at its start"
+        )
     facts = json.loads(row[0])
     stored = facts.pop("scenes")
     about = About(**{**facts, "ending": Ending(facts["ending"])})
@@ -171,7 +191,9 @@ def results_of(store: Store) -> Results:
     others = about.files.keys() - {scene.batch for scene in scenes}
     scenes += [SceneRecord(batch, failure=TOO_FEW) for batch in sorted(others)]
     points = {
-        (scene.batch, number): np.frombuffer(b64decode(cloud), "<f4").reshape(-1, 3).astype(float)
+        (scene.batch, number): np.frombuffer(b64decode(cloud), "<f4")
+        .reshape(-1, 3)
+        .astype(float)
         for scene in scenes
         for number, cloud in enumerate(scene.clouds)
     }

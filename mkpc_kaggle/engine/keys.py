@@ -51,7 +51,9 @@ def digest(value: Any) -> str:
 def text_digest(lines: Iterable[str]) -> str:
     """Return the digest of texts without line breaks, much faster than :func:`digest`."""
     text = "\n".join(lines)
-    return hashlib.blake2b(text.encode("utf-8", "backslashreplace"), digest_size=16).hexdigest()
+    return hashlib.blake2b(
+        text.encode("utf-8", "backslashreplace"), digest_size=16
+    ).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,9 @@ class Keys:
     @classmethod
     def of(cls, assembly: Assembly) -> "Keys":
         recipe = assembly.recipe
-        units = [digest([POINTS_VERSION, assembly.unit_settings(unit)]) for unit in recipe.units]
+        units = [
+            digest([POINTS_VERSION, assembly.unit_settings(unit)]) for unit in recipe.units
+        ]
         # All settings of a table: a new setting changes the keys, which costs a rerun but no wrong result.
         magsac = asdict(recipe.magsac)
         focal = recipe.focal and asdict(recipe.focal)
@@ -90,7 +94,9 @@ class Keys:
             assembly.masks,
         )
 
-    def of_points(self, unit: int, pair: Pair, images: Images, first: Sequence[str] = ()) -> str:
+    def of_points(
+        self, unit: int, pair: Pair, images: Images, first: Sequence[str] = ()
+    ) -> str:
         """Return the key of a unit's points on a pair.
 
         ``first`` are [mkpc] and the keys of the points that the pair's crops come from; empty for a unit of
@@ -100,7 +106,9 @@ class Keys:
         # An image without a mask has an empty digest.
         masks = [self.masks.digest(file) for file in (pair.file0, pair.file1)]
         turns = map(str, pair.turns)
-        return text_digest([self.units[unit], image0.digest, image1.digest, *turns, *masks, *first])
+        return text_digest(
+            [self.units[unit], image0.digest, image1.digest, *turns, *masks, *first]
+        )
 
     def of_estimate(self, points: Iterable[str]) -> str:
         """Return the key of a pair's estimate from its points, in the recipe's order."""
@@ -158,7 +166,9 @@ def read_images(
     new = [name for name in files if not images[name].digest]
     # Threads, since both reading and hashing release the interpreter lock.
     pool = ThreadPoolExecutor(HASH_THREADS)
-    pending = {pool.submit(lambda name: (name, image_facts(files[name])), name) for name in new}
+    pending = {
+        pool.submit(lambda name: (name, image_facts(files[name])), name) for name in new
+    }
     while pending and not is_over():
         done, pending = wait(pending, CHECK_S)
         progress.count("reading", len(new) - len(pending), len(new), "image")

@@ -94,7 +94,9 @@ class Place:
         if isinstance(answer, Loaded):
             self.is_loaded = True
             self.since = now
-        elif isinstance(answer, Failure) and not (self.is_loaded and answer.cause is Cause.RAISED):
+        elif isinstance(answer, Failure) and not (
+            self.is_loaded and answer.cause is Cause.RAISED
+        ):
             self.kill()
         return answer
 
@@ -138,7 +140,9 @@ class Site:
         estimators = 1 if threads else max(1, self._cores // CORES_PER_ESTIMATOR)
         make = partial(estimates_runner, in_process=not threads)
         worker = partial(self._worker, "estimates", make, self.ring, log)
-        self.places = [Place(f"estimates {n}", worker, Kind.ESTIMATE) for n in range(estimators)]
+        self.places = [
+            Place(f"estimates {n}", worker, Kind.ESTIMATE) for n in range(estimators)
+        ]
         self.places += [
             Place("scenes" if n == 0 else f"scenes {n}", self.scene_worker, Kind.SCENE)
             for n in range(self._cores)

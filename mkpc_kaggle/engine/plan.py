@@ -120,7 +120,9 @@ class Plan:
     def extra(self) -> int:
         """The number of extra pairs that fit in a tenth of the time, the most useful first."""
         state = self.state
-        seconds = self.costs.forecast(state.units[state.sweep].name) / max(1, self.crew.matchers)
+        seconds = self.costs.forecast(state.units[state.sweep].name) / max(
+            1, self.crew.matchers
+        )
         # A share of the time after the sweep, as it was before the first extra pair
         had = int(state.done[state.rows :, state.sweep].sum())
         most = CONNECT_SHARE * (self.left / max(seconds, 1e-9) + had)
@@ -195,9 +197,16 @@ class Plan:
             count = int((np.cumsum(known) * len(pairs) < JOB_SHARE * self.left).sum())
             units = units[: max(1, count)]
         # In the last phase, the order depends on inliers that come meanwhile.
-        upcoming = order[len(pairs) :][: self.crew.minibatch] if self.phase < FILL else order[:0]
+        upcoming = (
+            order[len(pairs) :][: self.crew.minibatch] if self.phase < FILL else order[:0]
+        )
         return MatchPlan(
-            self.phase, pairs.tolist(), units, seconds[: len(units)], self.left, upcoming.tolist()
+            self.phase,
+            pairs.tolist(),
+            units,
+            seconds[: len(units)],
+            self.left,
+            upcoming.tolist(),
         )
 
     def _order(self) -> NDArray[np.int_]:

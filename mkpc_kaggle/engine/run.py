@@ -13,7 +13,13 @@ from typing import cast
 
 import numpy as np
 
-from mkpc_kaggle.engine.budget import COST_OF_ESTIMATES, Budget, Costs, start_limit, time_limit
+from mkpc_kaggle.engine.budget import (
+    COST_OF_ESTIMATES,
+    Budget,
+    Costs,
+    start_limit,
+    time_limit,
+)
 from mkpc_kaggle.engine.frames import Results, results_of
 from mkpc_kaggle.engine.keys import of_candidate
 from mkpc_kaggle.engine.places import Kind, Place, Site
@@ -173,7 +179,9 @@ class Run:
                 self.progress.count(PHASES[plan.phase], int(done.sum()), done.size, "unit")
                 job = self._match_job(plan.match)
             elif plan.match is not None:
-                place.start(plan.now)  # loading takes long, and the plan may be another one then
+                place.start(
+                    plan.now
+                )  # loading takes long, and the plan may be another one then
         if job is not None:
             place.submit(job, plan.now)
 
@@ -252,10 +260,14 @@ class Run:
                 # In the recipe's order, as a crop's key has those of the points before it
                 key = state.key(index, unit)
                 rows.append(points_row(key, result))
-                state.use_points(index, unit, key, len(result.matches), is_needed=result.is_needed)
+                state.use_points(
+                    index, unit, key, len(result.matches), is_needed=result.is_needed
+                )
                 # A unit that the pair does not need took no time.
                 if result.is_needed:
-                    self.costs.observe(result.unit.name, result.seconds, warm_up=result.warm_up)
+                    self.costs.observe(
+                        result.unit.name, result.seconds, warm_up=result.warm_up
+                    )
                     self.about.units_run += 1
         self.store.put({"points": rows})
 
@@ -413,4 +425,8 @@ class Run:
         if is_complete(state, self.crew):
             return Ending.WITH_FAILURES if state.has_failures else Ending.COMPLETE
         has_estimators = bool(self.site.of(Kind.ESTIMATE))
-        return Ending.TIME_IS_UP if has_estimators and not self.site.is_closed else Ending.NO_WORKER
+        return (
+            Ending.TIME_IS_UP
+            if has_estimators and not self.site.is_closed
+            else Ending.NO_WORKER
+        )

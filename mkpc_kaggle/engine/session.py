@@ -59,14 +59,18 @@ class Session:
     fresh: bool = False
     progress: bool = True
     workers: int | str | None = 0
-    save: Callable[[], str] = lambda: "the time limit passed before the first results were written"
+    save: Callable[[], str] = lambda: (
+        "the time limit passed before the first results were written"
+    )
     status: int = 0
 
     def must_end(self) -> float:
         """Return the deadline of the report on the monotonic clock, when the watchdog ends the
         process.
         """
-        return time.monotonic() + REPORT_S if self.interrupt.signal else self.budget.final_write
+        return (
+            time.monotonic() + REPORT_S if self.interrupt.signal else self.budget.final_write
+        )
 
     @contextmanager
     def watched(self) -> Iterator[Self]:
@@ -79,7 +83,9 @@ class Session:
         """
         over = threading.Event()
         if isfinite(self.budget.time_limit):
-            threading.Thread(target=self._watch, args=(over,), name="watchdog", daemon=True).start()
+            threading.Thread(
+                target=self._watch, args=(over,), name="watchdog", daemon=True
+            ).start()
         try:
             yield self
         finally:

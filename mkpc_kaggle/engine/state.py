@@ -86,7 +86,10 @@ class State:
         self.order = np.asarray(visiting_order(self.pairs), int)
         self._start_pairs(len(self.pairs), len(self.units))
         self._start_batches()
-        self.titles = [*(unit.name for unit in self.units), "estimate"]  # of the columns of losses
+        self.titles = [
+            *(unit.name for unit in self.units),
+            "estimate",
+        ]  # of the columns of losses
 
     def _start_pairs(self, count: int, units: int) -> None:
         # Column by column: the plan looks at one unit of all pairs at a time.
@@ -113,7 +116,9 @@ class State:
         scene = self.request.recipe.scene
         batches = batches_of(self.pairs) if scene is not None else {}
         self.batches = {name: number for number, name in enumerate(batches)}
-        self.batch_of = np.array([self.batches.get(pair.group, -1) for pair in self.pairs], int)
+        self.batch_of = np.array(
+            [self.batches.get(pair.group, -1) for pair in self.pairs], int
+        )
         self.candidates = candidates_of(self.units, scene)
         size = (len(batches), len(self.candidates))
         self.made = np.full(size, None, object)  # of SceneRecord
@@ -200,7 +205,9 @@ class State:
         """Why each batch (B,) has no scene, if it has none."""
         may_match = self.is_row & (self.missing | (self.matches > 0)).any(1)
         reasons = np.where(self.by_batch(may_match), NOT_RECONSTRUCTED, NO_CAMERAS)
-        return [self.scene_failures.get(batch, why) for batch, why in enumerate(reasons.tolist())]
+        return [
+            self.scene_failures.get(batch, why) for batch, why in enumerate(reasons.tolist())
+        ]
 
     @property
     def has_failures(self) -> bool:
@@ -274,7 +281,9 @@ class State:
         for unit, crop in enumerate(self.is_crop.tolist()):
             count = len(self.pairs) if unit == self.sweep else self.rows
             keys = {index: self.key(index, unit) for index in range(count)}
-            stored = {key: row for key, *row in store.select("points", columns, keys.values())}
+            stored = {
+                key: row for key, *row in store.select("points", columns, keys.values())
+            }
             for index, key in keys.items():
                 matches, scale, detail, has_data = stored.get(key, (0, 0.0, 0.0, None))
                 # Under another rule than today's, the pair may have needed the unit, or not.

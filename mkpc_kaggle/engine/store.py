@@ -44,7 +44,9 @@ TABLES = {
         estimate TEXT, F BLOB, source TEXT, choice TEXT, error TEXT""",
     "run": "key INTEGER PRIMARY KEY, rows INTEGER, about TEXT",
 }
-SCHEMA = ";\n".join(f"CREATE TABLE main.{name} ({columns})" for name, columns in TABLES.items())
+SCHEMA = ";\n".join(
+    f"CREATE TABLE main.{name} ({columns})" for name, columns in TABLES.items()
+)
 SPARE = "ATTACH ':memory:' AS spare;\n"
 SPARE += SCHEMA.replace("TABLE main.", "TABLE spare.") + "".join(
     f";\nCREATE TEMP VIEW {name} AS SELECT * FROM spare.{name} UNION ALL SELECT * FROM main.{name} "
@@ -134,7 +136,9 @@ class Store:
         path = directory / FILE_NAME
         if not path.is_file():
             name = f"{directory} has no {FILE_NAME}"
-            raise UserError(f"{name}: name the work directory of a run (NAME.work, or OUT/work)")
+            raise UserError(
+                f"{name}: name the work directory of a run (NAME.work, or OUT/work)"
+            )
         with undamaged(path):
             try:
                 return cls(directory, checked(path, READ), path)
@@ -293,7 +297,9 @@ def undamaged(path: Path) -> Iterator[None]:
     try:
         yield
     except sqlite3.OperationalError as error:
-        raise UserError(f"{path} cannot be used: {error}; is another run using it?") from error
+        raise UserError(
+            f"{path} cannot be used: {error}; is another run using it?"
+        ) from error
     except sqlite3.DatabaseError as error:
         # The advice costs the user hours of results, so not for errors of this program, which are subclasses.
         if type(error) is not sqlite3.DatabaseError:

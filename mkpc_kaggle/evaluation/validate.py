@@ -127,13 +127,19 @@ def validate(
     rows = itertools.count()  # in the order of the pairs
     scored = []
     for scene in scenes:
-        scores = [score_pair(true, report.pairs, next(rows), scene, steps) for true in scene.pairs]
+        scores = [
+            score_pair(true, report.pairs, next(rows), scene, steps) for true in scene.pairs
+        ]
         scored.append(SceneScore(scene.name, tuple(scores)))
     return Validation(assembly.recipe.name, tuple(scored), report, tuple(steps))
 
 
 def score_pair(
-    true: TruePair, pairs: "DataFrame", row: int, scene: TrainScene, steps: Sequence[Step] = ()
+    true: TruePair,
+    pairs: "DataFrame",
+    row: int,
+    scene: TrainScene,
+    steps: Sequence[Step] = (),
 ) -> PairScore:
     """Return the score of the pair in a row of the run's table of pairs.
 
@@ -166,7 +172,9 @@ def error_of(matrix: ArrayLike | None, true: TruePair, scene: TrainScene) -> Pos
     return metrics.pose_error(F, true.camera0, true.camera1, scene.metres_per_unit)
 
 
-def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]) -> Validation:
+def score_submission(
+    submission: Path, truth: Path, scenes: Sequence[TrainScene]
+) -> Validation:
     """Score a submission whose samples are known pairs of a train side.
 
     ``truth`` is a table ``sample_id,scene,image_1_id,image_2_id``, with the image names of the
@@ -186,14 +194,19 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]
     missing = []
     for there in scenes:
         known = [true for true in there.pairs if true.pair.id in samples]
-        missing += [sample for sample, F in (samples[true.pair.id] for true in known) if F is None]
+        missing += [
+            sample for sample, F in (samples[true.pair.id] for true in known) if F is None
+        ]
         pairs = [
-            scored_pair(true, error_of(samples[true.pair.id][1], true, there)) for true in known
+            scored_pair(true, error_of(samples[true.pair.id][1], true, there))
+            for true in known
         ]
         if pairs:
             scored.append(SceneScore(there.name, tuple(pairs)))
     if len(missing) == sum(len(scene.pairs) for scene in scored):
-        raise UserError(f"{truth} names no pair of the scenes that {submission} has a row for")
+        raise UserError(
+            f"{truth} names no pair of the scenes that {submission} has a row for"
+        )
     return Validation(submission.name, tuple(scored), missing=tuple(missing))
 
 
@@ -234,7 +247,9 @@ def paired_difference(scenes: Sequence[Paired]) -> Difference:
 
 
 def _resampled_means(
-    gains: NDArray[np.float64], images: Sequence[tuple[str, str]], generator: np.random.Generator
+    gains: NDArray[np.float64],
+    images: Sequence[tuple[str, str]],
+    generator: np.random.Generator,
 ) -> NDArray[np.float64]:
     """Return weighted means (RESAMPLES,) of the gains (P,), one for each draw of image weights."""
     names, ends = np.unique(np.array(images), return_inverse=True)
@@ -304,11 +319,15 @@ def comparison_table(validations: Sequence[Validation]) -> list[str]:
     lines = [f"{'recipe':<40}{'mAA':>9}"]
     lines += [f"{run.recipe:<40}{run.maa():>9.4f}" for run in validations]
     for other in others:
-        lines.append(f"{other.recipe} against {first.recipe}: gain of mAA, {LEVEL:.0%} interval")
+        lines.append(
+            f"{other.recipe} against {first.recipe}: gain of mAA, {LEVEL:.0%} interval"
+        )
         for scene in first.scenes:
             count = len(scene.pairs)
             lines.append(f"{scene.scene:<20}{count:>6}  {gain_of(other, first, scene.scene)}")
-        lines.append(f"{'mean over scenes':<20}{len(first.errors):>6}  {gain_of(other, first)}")
+        lines.append(
+            f"{'mean over scenes':<20}{len(first.errors):>6}  {gain_of(other, first)}"
+        )
     return lines
 
 
@@ -324,7 +343,9 @@ def to_json(validation: Validation) -> dict[str, Any]:
                 "translation_error_metres": error.translation,
                 "translation_error_degrees": error.translation_angle,
             }
-            finite = {name: value if isfinite(value) else None for name, value in values.items()}
+            finite = {
+                name: value if isfinite(value) else None for name, value in values.items()
+            }
             steps = {step: metrics.pair_accuracy(found) for step, found in pair.steps.items()}
             pairs.append(
                 {

@@ -109,7 +109,13 @@ class View:
 
     @classmethod
     def fit(
-        cls, crop: Box, *, long_side: int = 0, area: int = 0, multiple: int = 1, turns: int = 0
+        cls,
+        crop: Box,
+        *,
+        long_side: int = 0,
+        area: int = 0,
+        multiple: int = 1,
+        turns: int = 0,
     ) -> "View":
         """Return the view of ``crop`` with a longer side of ``long_side``, or with about ``area``.
 

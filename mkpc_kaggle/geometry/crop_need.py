@@ -13,7 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, RegionReason, When
+from mkpc_kaggle.geometry.critical_region import (
+    CriticalRegion,
+    MkpcConfig,
+    RegionReason,
+    When,
+)
 from mkpc_kaggle.geometry.matches import Matches
 
 MIN_SCALE_MATCHES = 8  # fewer say nothing about scale

@@ -42,7 +42,9 @@ from mkpc_kaggle.geometry.robust import (
 )
 from mkpc_kaggle.geometry.two_view import Problem, TwoView, Vectors, robust_costs, sampson
 
-ESSENTIAL_STARTS = 5  # estimates of E, at evenly spaced quantiles of the prior on focal lengths
+ESSENTIAL_STARTS = (
+    5  # estimates of E, at evenly spaced quantiles of the prior on focal lengths
+)
 # Share and minimum number of the matches for each of them.
 ESSENTIAL_SHARE = 0.25
 MIN_ESSENTIAL = 50
@@ -154,7 +156,9 @@ def estimate_with_prior(
             reasons = "; ".join(dict.fromkeys(failures)) or "no candidate has a finite cost"
             return Estimate.failed(model, len(matches), reasons)
         inliers = np.abs(sampson(best.fundamental, *search.rays)) < magsac.threshold
-        matrix = best.fundamental if model is ModelKind.E else search.for_pixels(best.fundamental)
+        matrix = (
+            best.fundamental if model is ModelKind.E else search.for_pixels(best.fundamental)
+        )
     own = unit_norm(search.for_pixels(plain.fundamental)) if plain else None
     return Estimate(model, unit_norm(matrix), distinct.mask_of_all(inliers), magsac=own)
 
@@ -203,7 +207,9 @@ class _Search:
         weight = count / max(len(few), 1)
         return Problem(rays0[few], rays1[few], self._sigmas, weight)
 
-    def starts(self, magsac: RobustConfig) -> tuple[list[_Candidate], list[TwoView], list[str]]:
+    def starts(
+        self, magsac: RobustConfig
+    ) -> tuple[list[_Candidate], list[TwoView], list[str]]:
         """Return MAGSAC's candidates for F, all starts, and the reasons for missing starts.
 
         Starts come from these candidates and from estimates of E.
@@ -296,7 +302,9 @@ class _Search:
 
         ``view`` is one of the four poses of F. The one with the fewest points behind counts.
         """
-        saved = 0.5 - robust_costs(sampson(F, *self.rays), self._scale)  # against an outlier's 0.5
+        saved = 0.5 - robust_costs(
+            sampson(F, *self.rays), self._scale
+        )  # against an outlier's 0.5
         behind = []
         for each in (view, view.twisted):
             signs = each.depth_signs(*self.rays, 3 * self._scale)

@@ -97,7 +97,9 @@ class Matches:
     def __len__(self) -> int:
         return len(self.scores)
 
-    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.integer] | slice) -> "Matches":
+    def __getitem__(
+        self, index: NDArray[np.bool_] | NDArray[np.integer] | slice
+    ) -> "Matches":
         """Return the matches selected by a mask, indices or a slice."""
         return Matches(self.points0[index], self.points1[index], self.scores[index])
 

@@ -45,7 +45,9 @@ class PoseError:
         return max(self.rotation, self.translation_angle)
 
 
-def pose_error(F: Matrix3, camera0: Camera, camera1: Camera, metres_per_unit: float) -> PoseError:
+def pose_error(
+    F: Matrix3, camera0: Camera, camera1: Camera, metres_per_unit: float
+) -> PoseError:
     """Return the pose error of F.
 
     A submission has no points to select one of F's two rotations. So the rotation nearer to the
@@ -86,7 +88,9 @@ def pair_accuracy(error: PoseError) -> float:
     A scene's mAA is the mean over pairs. Source: evaluation page of the Image Matching Challenge
     2022.
     """
-    meets = (error.rotation < ROTATION_THRESHOLDS) & (error.translation < TRANSLATION_THRESHOLDS)
+    meets = (error.rotation < ROTATION_THRESHOLDS) & (
+        error.translation < TRANSLATION_THRESHOLDS
+    )
     return float(np.mean(meets))
 
 

@@ -50,7 +50,9 @@ class RobustConfig:
 
     threshold: float = 0.2  # pixels of the stored image
     max_iterations: int = 50_000
-    confidence: float = 0.99999  # probability that no better model remains, where iterations stop
+    confidence: float = (
+        0.99999  # probability that no better model remains, where iterations stop
+    )
 
     def __post_init__(self) -> None:
         check_ranges(self, threshold=POSITIVE, max_iterations=Range(1, 10**6))
@@ -135,7 +137,9 @@ def consensus(
     if intrinsics is not None and model is ModelKind.E:
         points0 = calibrate(points0, intrinsics[0])
         points1 = calibrate(points1, intrinsics[1])
-        settings["focal"] = float(np.mean([K[axis, axis] for K in intrinsics for axis in (0, 1)]))
+        settings["focal"] = float(
+            np.mean([K[axis, axis] for K in intrinsics for axis in (0, 1)])
+        )
     try:
         matrix, mask = solver.find(points0, points1, **settings)
     except cv2.error as error:

@@ -71,7 +71,9 @@ class TwoView:
         half_turn = 2 * np.outer(self.t, self.t) - np.eye(3)  # about t
         return TwoView(half_turn @ self.R, self.t, self.logs)
 
-    def depth_signs(self, rays0: Vectors, rays1: Vectors, error: float) -> NDArray[np.float64]:
+    def depth_signs(
+        self, rays0: Vectors, rays1: Vectors, error: float
+    ) -> NDArray[np.float64]:
         """Return (N,) signs: 1 for a point in front of both cameras, -1 behind both, 0 otherwise.
 
         The point is the least-squares solution of X_1 = R X_0 + t along the rays. With -t the signs
@@ -105,7 +107,9 @@ class TwoView:
         factors = _focal_factors(self.logs)
         # A small rotation w changes R by [w]x R, a small step along t's tangent changes [t]x.
         turns = cross_matrix(self.t) @ CROSS @ self.R * factors  # (3, 3, 3)
-        shifts = np.tensordot(self._tangent_basis().T, CROSS, 1) @ self.R * factors  # (2, 3, 3)
+        shifts = (
+            np.tensordot(self._tangent_basis().T, CROSS, 1) @ self.R * factors
+        )  # (2, 3, 3)
         # Focal length 0 is a factor of F's last column, focal length 1 of its last row.
         by_log0 = np.zeros((3, 3))
         by_log0[:, 2] = F[:, 2]
@@ -190,7 +194,9 @@ class Problem:
     def _precisions(self) -> Vectors:
         return np.array([1 / sigma**2 if sigma else 0.0 for sigma in self.sigmas])
 
-    def _step(self, gradient: Vectors, curvature: NDArray[np.float64], damping: float) -> Vectors:
+    def _step(
+        self, gradient: Vectors, curvature: NDArray[np.float64], damping: float
+    ) -> Vectors:
         """Return the damped step (7,), or NaN, which is rejected, for a singular system."""
         free = self._free
         step = np.zeros(7)
@@ -203,7 +209,9 @@ class Problem:
             step[free] = np.nan
         return step
 
-    def _derivatives(self, view: TwoView, scale: float) -> tuple[Vectors, NDArray[np.float64]]:
+    def _derivatives(
+        self, view: TwoView, scale: float
+    ) -> tuple[Vectors, NDArray[np.float64]]:
         """Return the gradient (7,) of the cost, and its Gauss-Newton Hessian (7, 7)."""
         lines0, lines1, slope = _lines(view.fundamental, self.rays0, self.rays1)
         distances = _row_dots(self.rays1, lines1) / slope  # r

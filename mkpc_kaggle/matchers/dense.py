@@ -11,7 +11,12 @@ from torch import Tensor
 from mkpc_kaggle.config import AT_LEAST_1, SHARE, Range, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture, TrainedOptions
+from mkpc_kaggle.matchers.contract import (
+    MatcherSpec,
+    PairwiseMatcher,
+    Picture,
+    TrainedOptions,
+)
 from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.dense_sampling import sample_matches
 from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseNetwork
@@ -98,7 +103,9 @@ class DenseMatcher(PairwiseMatcher[DenseEncoding]):
         return multiple * rows, multiple * columns
 
     @torch.inference_mode()
-    def candidates(self, first: DenseEncoding, second: DenseEncoding) -> tuple[Tensor, Tensor]:
+    def candidates(
+        self, first: DenseEncoding, second: DenseEncoding
+    ) -> tuple[Tensor, Tensor]:
         """Return all points that matches are sampled from, and their certainties (N,).
 
         Points (N, 4) are x and y in the first, then the second image, normalised.

@@ -39,8 +39,8 @@ def fastest_precision(device: str) -> Precision:
         return Precision.FLOAT16 if able else Precision.FLOAT32
     # Older versions of PyTorch do not report capabilities; then float32 is safe.
     flags: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
-    able = bool(flags.get("avx512_bf16") or flags.get("amx_bf16"))
-    return Precision.BFLOAT16 if able else Precision.FLOAT32
+    is_able = flags.get("avx512_bf16") or flags.get("amx_bf16")
+    return Precision.BFLOAT16 if is_able else Precision.FLOAT32
 
 
 def gpus_of(device: str) -> list[int]:
@@ -57,8 +57,7 @@ def gpus_of(device: str) -> list[int]:
             f"--device {device}: this machine has no GPU that PyTorch can use; {ADVICE}"
         )
     if number and int(number) >= count:
-        known = ", ".join(f"cuda:{index}" for index in range(count))
-        raise UserError(f"--device {device}: this machine has only {known}")
+        raise UserError(f"--device {device}: this machine has {count} GPU(s)")
     return [int(number)] if number else list(range(count))
 
 
@@ -78,5 +77,5 @@ def require_device(device: str) -> None:
     except Exception as error:
         if failure_kind(error) is FailureKind.OUT_OF_MEMORY:
             raise
-        reason = reason_of(error).partition("\n")[0]
+        reason = reason_of(error).splitlines()[0]
         raise DeviceError(f"{device} cannot be used ({reason}); {ADVICE}") from error

@@ -49,7 +49,9 @@ def load_matcher(
     Raises :class:`UserError` if its weights are missing or damaged.
     """
     with exact_float32():
-        matcher: Matcher[Any] = import_module(MATCHERS[name]).load(weights, options, placement)
+        matcher: Matcher[Any] = import_module(MATCHERS[name]).load(
+            weights, options, placement
+        )
     return matcher
 
 

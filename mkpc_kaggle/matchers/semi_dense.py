@@ -91,7 +91,9 @@ class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
 
 def semi_dense_spec(name: str, multiple: int) -> MatcherSpec:
     """Return the spec of a network with weights for outdoors and indoors."""
-    return MatcherSpec(name, SemiDenseOptions, Colour.GRAY, multiple, (f"{name}-{{training}}",))
+    return MatcherSpec(
+        name, SemiDenseOptions, Colour.GRAY, multiple, (f"{name}-{{training}}",)
+    )
 
 
 def load_semi_dense(
@@ -103,7 +105,9 @@ def load_semi_dense(
 ) -> SemiDenseMatcher:
     """Load the published checkpoint into a network from ``make``."""
     (slot,) = spec.slots_for(options)
-    tensors = {name.removeprefix(PREFIX): tensor for name, tensor in weights.load(slot).items()}
+    tensors = {
+        name.removeprefix(PREFIX): tensor for name, tensor in weights.load(slot).items()
+    }
     network = make(options.training)
     load_into(network, tensors, what=slot, unused=UNUSED)
     network.threshold = options.threshold

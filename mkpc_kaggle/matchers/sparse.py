@@ -74,7 +74,9 @@ def keypoint_encoder(detect: Detector, placement: Placement) -> Encode:
         encodings = []
         for (points, descriptors), picture in zip(found, pictures, strict=True):
             # A library's network may return half precision.
-            on_content = Keypoints.on_content(points.float(), descriptors.float(), picture.content)
+            on_content = Keypoints.on_content(
+                points.float(), descriptors.float(), picture.content
+            )
             encodings.append(on_content)
         return encodings
 
@@ -90,7 +92,9 @@ def library_encoder(
     the output of its module ``features`` is not finite: detectors drop NaN scores in silence.
     """
     network.eval().to(placement.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    features.register_forward_hook(lambda *call: check_finite(f"features of {name}", call[-1]))
+    features.register_forward_hook(
+        lambda *call: check_finite(f"features of {name}", call[-1])
+    )
 
     def detect_in_precision(images: Tensor) -> Iterable[tuple[Tensor, Tensor]]:
         with autocast(placement):

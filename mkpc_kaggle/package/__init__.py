@@ -68,7 +68,9 @@ def make_package(
         )
     for python in pythons:
         if not re.fullmatch(r"3\.[0-9]{1,2}", python):
-            raise UserError(f"--python {python[:20]!r}: expected versions such as {PYTHONS[0]}")
+            raise UserError(
+                f"--python {python[:20]!r}: expected versions such as {PYTHONS[0]}"
+            )
     if wheels is not None and not wheels.is_dir():
         raise UserError(f"--wheels {wheels}: no such directory")
     checkout = find_checkout()
@@ -176,7 +178,14 @@ def collect_wheels(
     )
     platforms = [option for platform in PLATFORMS for option in ("--platform", platform)]
     source = [] if wheels is None else ["--no-index", "--find-links", str(wheels)]
-    options = ["--only-binary=:all:", "--no-deps", *platforms, *source, "--dest", str(directory)]
+    options = [
+        "--only-binary=:all:",
+        "--no-deps",
+        *platforms,
+        *source,
+        "--dest",
+        str(directory),
+    ]
     for python in counted([*pythons], "wheels by pip", "Python"):
         failure = run_pip("download", *options, "--python-version", python, *pinned)
         if failure:
@@ -214,7 +223,9 @@ def as_safetensors(found: FoundFile, directory: Path) -> WeightFile:
         source = f"{name} ({found.sha256}) with the same tensor names"
         # safetensors refuses views and tensors that share their bytes.
         tensors = load_tensors(found.path)
-        save_file({key: tensor.contiguous().clone() for key, tensor in tensors.items()}, target)
+        save_file(
+            {key: tensor.contiguous().clone() for key, tensor in tensors.items()}, target
+        )
     return WeightFile(
         found.file.slot,
         found.file.licence,

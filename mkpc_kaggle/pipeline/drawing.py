@@ -31,9 +31,7 @@ def draw_pair(images: tuple[Image, Image], match: PairMatch) -> "Figure":
     figure = new_figure(12, 5)  # inches: legible on a screen of 1,320 pixels
     axes = figure.subplots()
     draw_matches(axes, images, match)
-    counts = (
-        f"{plural(len(match.matches), 'match')}, {plural(match.estimate.inlier_count, 'inlier')}"
-    )
+    counts = f"{plural(len(match.matches), 'match')}, {plural(match.estimate.inlier_count, 'inlier')}"
     failure = f"; {match.estimate.failure}" if match.estimate.failure else ""
     axes.set_title(f"{counts} (green){failure}", loc="left")
     return figure
@@ -73,7 +71,10 @@ def draw_matches(
             x = np.array([box.left, box.left, box.right, box.right])
             y = np.array([box.top, box.bottom, box.bottom, box.top])
             # A box has borders of pixels, a view maps centres. A view may be turned.
-            corners = (view.from_image(np.column_stack([x, y]) - 0.5) + 0.5) / height + (left, 0)
+            corners = (view.from_image(np.column_stack([x, y]) - 0.5) + 0.5) / height + (
+                left,
+                0,
+            )
             axes.add_patch(Polygon(corners, fill=False, edgecolor=REGION, linewidth=2.5))
         ends.append((view.from_image(points) + 0.5) / height + (left, 0))
         left += width / height
@@ -110,7 +111,9 @@ def new_figure(
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise UserError("figures need matplotlib: pip install 'mkpc-kaggle[plots]'") from error
+        raise UserError(
+            "figures need matplotlib: pip install 'mkpc-kaggle[plots]'"
+        ) from error
     return Figure(figsize=(width, height), layout=layout)
 
 

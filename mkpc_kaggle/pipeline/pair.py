@@ -34,7 +34,9 @@ class UnitResult:
     encode_seconds: float = 0.0
     match_seconds: float = 0.0
     failure: str = ""  # the reason for a result without matches
-    warm_up: bool = False  # the first run of the unit in this process, which may take much longer
+    warm_up: bool = (
+        False  # the first run of the unit in this process, which may take much longer
+    )
     note: str = ""  # why the unit did not run as written
     keypoints: int = 0  # detected in the first view; 0 for a matcher without a detector
     need: CropNeed | None = None  # of stage 2; one that is not needed has no matches
@@ -115,7 +117,11 @@ class PairMatch:
 
     @classmethod
     def of_stored(
-        cls, stored: Iterable[tuple[Unit, bytes | None, str]], F: Matrix3, count: int, failure: str
+        cls,
+        stored: Iterable[tuple[Unit, bytes | None, str]],
+        F: Matrix3,
+        count: int,
+        failure: str,
     ) -> "PairMatch":
         """Return a pair from the matches of its units, as bytes, if any, and its regions, as text. The inliers
         of F are the ``count`` matches that are nearest to it.
@@ -179,5 +185,7 @@ def with_estimate(
             both = zip(sizes, focals, strict=True)
             priors = [FocalPrior.of_image(size, focal) for size, focal in both]
         first, second = priors
-        found = estimate_with_prior(matches, (first, second), recipe.magsac, recipe.focal, model)
+        found = estimate_with_prior(
+            matches, (first, second), recipe.magsac, recipe.focal, model
+        )
     return replace(pair, results=results, estimate=found)

@@ -75,7 +75,9 @@ class Pipeline:
         self._minibatches: dict[Unit, int] = {}  # of units that ran out of memory
         self._ran: set[Unit] = set()  # their times no longer include a warm-up
         self._matchers: dict[str, Matcher[Any]] = {}
-        self._unloadable: dict[str, Exception] = {}  # by matcher; its units fail with the error
+        self._unloadable: dict[
+            str, Exception
+        ] = {}  # by matcher; its units fail with the error
         self._notes: dict[str, str] = {}  # on matchers that fell back to float32
         self._encodings = ByteCache(cache_bytes)  # by matcher, content of the image, and view
 
@@ -104,7 +106,9 @@ class Pipeline:
             assembly.load,
             minibatch=assembly.minibatch,
             cache_bytes=cache_bytes,
-            load_float32=None if exact == placement else partial(assembly.load, placement=exact),
+            load_float32=None
+            if exact == placement
+            else partial(assembly.load, placement=exact),
             masks=assembly.masks,
             synchronise=synchronise,
         )
@@ -185,7 +189,9 @@ class Pipeline:
             if results is None:
                 continue
             for number, result in zip(numbers, results, strict=True):
-                pairs[number] = replace(pairs[number], results=(*pairs[number].results, result))
+                pairs[number] = replace(
+                    pairs[number], results=(*pairs[number].results, result)
+                )
             waiting = waiting[size:]
 
     def _run_minibatch(self, unit: Unit, pairs: list[PairMatch]) -> list[UnitResult] | None:
@@ -204,7 +210,9 @@ class Pipeline:
                 error.add_note(f"in {unit.name}")
                 raise
             if failure is FailureKind.RAISED and len(pairs) == 1:
-                reason = str(error) if isinstance(error, UnloadableError) else reason_of(error)
+                reason = (
+                    str(error) if isinstance(error, UnloadableError) else reason_of(error)
+                )
                 return [UnitResult(unit, Matches.empty(), failure=reason)]
             if failure is FailureKind.RAISED:
                 return [self._run_alone(unit, pair) for pair in pairs]

@@ -161,7 +161,9 @@ class TwoStageMatcher:
         """Check the arguments of a pair, run all units, and estimate the model."""
         matrices = None if intrinsics is None else intrinsics_of(intrinsics)
         if kind is ModelKind.E and matrices is None:
-            raise ValueError("model E needs intrinsics=(K0, K1), the camera matrices in pixels")
+            raise ValueError(
+                "model E needs intrinsics=(K0, K1), the camera matrices in pixels"
+            )
         source0, source1 = sources
         images = (as_image(source0, store), as_image(source1, store))
         (pair,) = self._pipeline.match([PairMatch(images=images)], self.recipe.units)

@@ -59,7 +59,9 @@ def read_folder(root: Path) -> list[Path]:
     for file in files:
         name = file.relative_to(root).as_posix()
         if CONTROL.search(name) or printable(name) != name:
-            raise UserError(f"{root}: the name {name!r} has characters that are no text; rename it")
+            raise UserError(
+                f"{root}: the name {name!r} has characters that are no text; rename it"
+            )
     return sorted(files)
 
 
@@ -86,7 +88,9 @@ def read_pair_list(path: Path, root: Path, files: Sequence[Path]) -> list[Ends]:
         ]
         ends = [(a, b) for a, b in ways if a != b and known.issuperset((a, b))]
         if len(ends) != 1:
-            raise UserError(f"{path}, line {number}: {text!r} does not name two images of {root}")
+            raise UserError(
+                f"{path}, line {number}: {text!r} does not name two images of {root}"
+            )
         pairs.append((min(ends[0]), max(ends[0])))
     if not pairs:
         raise UserError(f"{path} has no pairs")
@@ -130,7 +134,9 @@ def read_intrinsics(path: Path, root: Path, files: Sequence[Path]) -> Rows:
 
 def _names(pattern: str, image: Path) -> bool:
     # macOS writes "é" as two characters, most tables as one.
-    pattern, path = (unicodedata.normalize("NFC", text) for text in (pattern, image.as_posix()))
+    pattern, path = (
+        unicodedata.normalize("NFC", text) for text in (pattern, image.as_posix())
+    )
     ways = (path, path.rpartition("/")[2])
     # A file may be called "photo [1].jpg", and as a pattern this is another.
     return pattern in ways or any(fnmatch.fnmatchcase(name, pattern) for name in ways)

@@ -45,7 +45,9 @@ def require_out(out: Path, inputs: Iterable[Path]) -> None:
             )
     with writing(f"--out {out}"):
         (out / WORK).mkdir(parents=True, exist_ok=True)
-        names = {path.name for path in out.iterdir() if not path.name.startswith(".")} - {WORK}
+        names = {path.name for path in out.iterdir() if not path.name.startswith(".")} - {
+            WORK
+        }
         if names and not (out / WORK / FILE_NAME).is_file():
             raise UserError(
                 f"--out {out} has {min(names)}, and no run of this command made it; name an empty folder"
@@ -173,7 +175,9 @@ def values_of(model: Any) -> SfmModel:
 
 def images_of(model: Any) -> list[Any]:
     """Return the registered images of pycolmap's model by name, since its containers have no order."""
-    return sorted((model.images[n] for n in model.reg_image_ids()), key=lambda image: image.name)
+    return sorted(
+        (model.images[n] for n in model.reg_image_ids()), key=lambda image: image.name
+    )
 
 
 def camera_rows(models: Sequence[SfmModel]) -> Iterator[Sequence[object]]:
@@ -190,7 +194,10 @@ def camera_rows(models: Sequence[SfmModel]) -> Iterator[Sequence[object]]:
                 found.image.name,
                 number,
                 # Twelve digits: later ones are rounding.
-                *(";".join(f"{value:.12g}" for value in matrix.ravel()) for matrix in matrices),
+                *(
+                    ";".join(f"{value:.12g}" for value in matrix.ravel())
+                    for matrix in matrices
+                ),
                 found.points,
                 lens.model,
                 *found.image.size,
@@ -206,7 +213,9 @@ def undistort(models: Sequence[Any], root: Path, out: Path, made: Path) -> None:
     """
     import pycolmap
 
-    photographs, source, target = (made / name for name in ("photographs", "source", "target"))
+    photographs, source, target = (
+        made / name for name in ("photographs", "source", "target")
+    )
     for folder in (photographs, source, made / IMAGES, made / SPARSE):
         folder.mkdir()
     linked = out.resolve() / IMAGES

@@ -19,7 +19,9 @@ class Child:
         # A fork would copy the locks of the parent's threads.
         context = get_context("spawn")
         self._answers, sender = context.Pipe(duplex=False)
-        self._process = context.Process(target=_run, args=(sender, function, args), daemon=True)
+        self._process = context.Process(
+            target=_run, args=(sender, function, args), daemon=True
+        )
         self._process.start()
         # The child's end alone stays open, so its death ends the wait.
         sender.close()
@@ -35,7 +37,9 @@ class Child:
             answer = self._answers.recv()
         except EOFError:
             self._process.join()
-            raise UserError(f"its process ended with status {self._process.exitcode}") from None
+            raise UserError(
+                f"its process ended with status {self._process.exitcode}"
+            ) from None
         if isinstance(answer, UserError):
             raise answer
         return answer

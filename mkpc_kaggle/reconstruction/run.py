@@ -18,7 +18,12 @@ from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.recipe import CameraModel, CameraSharing, Recipe, SceneConfig
-from mkpc_kaggle.reconstruction.folder import Ends, read_folder, read_intrinsics, read_pair_list
+from mkpc_kaggle.reconstruction.folder import (
+    Ends,
+    read_folder,
+    read_intrinsics,
+    read_pair_list,
+)
 from mkpc_kaggle.reconstruction.outputs import (
     FOLDERS,
     PAGE,
@@ -122,7 +127,9 @@ def reconstruct(
             # Objects of the user's program may not exist in other processes.
             workers = 0 if matchers else None
             budget = Budget(time.monotonic())
-            session = Session(out / WORK, budget, interrupt, progress=progress, workers=workers)
+            session = Session(
+                out / WORK, budget, interrupt, progress=progress, workers=workers
+            )
         session.status = 1  # until a model exists
         with session.interrupt.raising():  # digests of weights and a shortlist take long
             assembly = assemble(
@@ -158,7 +165,9 @@ def for_cameras(recipe: Recipe, sharing: str | None = None) -> Recipe:
     """
     scene = recipe.scene or SceneConfig()
     # The folder has its pairs already.
-    scene = replace(scene, pairs_per_image=0.0, cameras=CameraSharing(sharing or scene.cameras))
+    scene = replace(
+        scene, pairs_per_image=0.0, cameras=CameraSharing(sharing or scene.cameras)
+    )
     if scene.camera_model is CameraModel.AUTO:
         scene = replace(scene, camera_model=CameraModel.SIMPLE_RADIAL)  # as in COLMAP
     units = recipe.units

@@ -100,7 +100,9 @@ def page(found: Results, pairs: Sequence[Pair] = ()) -> str:
         *section("What failed", paragraphs(failures(found))),
         *section("Cameras", cameras_of(found)),
         *section("Pairs with the fewest inliers", pictures(found, pairs)),
-        *section("Pairs", table(found.pairs.sort_values("inliers", kind="stable"), SHOWN_OF_PAIRS)),
+        *section(
+            "Pairs", table(found.pairs.sort_values("inliers", kind="stable"), SHOWN_OF_PAIRS)
+        ),
         *section("Units", table(unit_table(found.units).reset_index(names="unit"))),
     ]
     head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style>'
@@ -125,7 +127,9 @@ def table(rows: "DataFrame", columns: Sequence[str] = ()) -> Iterator[str]:
     """Yield the first rows of a table, if it has any."""
     if len(rows):
         shown = rows[:MAX_ROWS][list(columns or rows.columns)]
-        text = shown.to_html(index=False, border=0, float_format="{:.4g}".format, justify="left")
+        text = shown.to_html(
+            index=False, border=0, float_format="{:.4g}".format, justify="left"
+        )
         yield f'<div class="rows">{text}</div>'
     if len(rows) > MAX_ROWS:
         yield f'<p class="dim">The first {MAX_ROWS} of {len(rows)} rows.</p>'
@@ -168,13 +172,17 @@ def pictures(found: Results, pairs: Sequence[Pair]) -> Iterator[str]:
     for name in counted(names, "drawing", "pair"):
         match = next(matches)
         pair = known[name]
-        caption = f"{name}: {match.estimate.inlier_count} inliers of {len(match.matches)} matches"
+        caption = (
+            f"{name}: {match.estimate.inlier_count} inliers of {len(match.matches)} matches"
+        )
         # An image may have been removed since.
         with suppress(UserError):
             first, second = (
                 as_image(path).turned(turns)
                 for path, turns in zip(pair.images, pair.turns, strict=True)
             )
-            data = base64.b64encode(encode(draw_strip((first, second), match), "jpeg")).decode()
+            data = base64.b64encode(
+                encode(draw_strip((first, second), match), "jpeg")
+            ).decode()
             image = f'<img src="data:image/jpeg;base64,{data}" alt="{escape(caption)}">'
             yield f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"

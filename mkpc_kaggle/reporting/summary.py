@@ -66,7 +66,9 @@ def counts(pairs: "DataFrame", scenes: "DataFrame") -> list[str]:
     lines = [f"F: {', '.join(parts)}"]
     inliers = pairs["inliers"][is_solved(pairs)]
     if len(inliers):
-        lines.append(f"inliers of a pair: median {inliers.median():.0f}, minimum {inliers.min()}")
+        lines.append(
+            f"inliers of a pair: median {inliers.median():.0f}, minimum {inliers.min()}"
+        )
     has_models = scenes["models"] > 0
     for scene in scenes[has_models][:MAX_SCENES].to_dict("records"):
         models = plural(scene["models"], "model")
@@ -172,9 +174,7 @@ def trouble(found: Results) -> str:
         return ""
     ((reason, count),) = reasons.most_common(1)
     share = f"{reasons.total()} of {plural(len(reached), 'pair')}"
-    return (
-        f"the run failed: {share} got no F because of errors; the most frequent ({count}): {reason}"
-    )
+    return f"the run failed: {share} got no F because of errors; the most frequent ({count}): {reason}"
 
 
 def left_out_line(recipe: Recipe, left_out: Sequence[str]) -> str:

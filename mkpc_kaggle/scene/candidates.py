@@ -74,7 +74,9 @@ def disagreement(pairs: Sequence[BatchPair], models: Sequence[SfmModel]) -> floa
     the pairs that have one. An angle counts up to ``MAX_ANGLE_DEG``, as does a pair without cameras in one
     of the ``models``: cameras for few images do not win.
     """
-    cameras = [{found.image.digest: found.camera for found in model.images} for model in models]
+    cameras = [
+        {found.image.digest: found.camera for found in model.images} for model in models
+    ]
     angles = []
     for pair in pairs:
         ends = (pair.image0.digest, pair.image1.digest)

@@ -30,7 +30,9 @@ from mkpc_kaggle.scene.view_graph import BatchPair
 
 CONTRADICTION_ERROR_PX = 2.0  # maximum Sampson distance of a match that agrees with an F
 CONTRADICTION_MATCHES = 30  # minimum number of matches that agree with the pair's F
-CONTRADICTION_SHARE = 0.05  # minimum share of these matches that must agree with the scene's F
+CONTRADICTION_SHARE = (
+    0.05  # minimum share of these matches that must agree with the scene's F
+)
 # The scale of the evidence for an F; larger in images with a longer side
 EVIDENCE_PX, EVIDENCE_SIDE = 1.0, 1536
 EVIDENCE_MATCHES = 60.0  # minimum evidence for the pair's F, of all units
@@ -105,7 +107,9 @@ def from_cameras(pair: BatchPair, models: Sequence[ModelImages]) -> Choice:
     model = next((model for model in models if model.keys() >= set(digests)), None)
     if model is None:
         registered = {digest for model in models for digest in model}
-        return Choice(None, Reason.APART if registered >= set(digests) else Reason.UNREGISTERED)
+        return Choice(
+            None, Reason.APART if registered >= set(digests) else Reason.UNREGISTERED
+        )
     if any(model[digest].has_distortion for digest in digests):
         return Choice(None, Reason.DISTORTED)
     try:
@@ -133,7 +137,9 @@ def contradicts(F: Matrix3, pair: BatchPair) -> bool:
         return True
     with_scene = _agreeing(F, pair)
     with_own = _agreeing(own, pair)
-    return bool(with_own >= CONTRADICTION_MATCHES and with_scene < CONTRADICTION_SHARE * with_own)
+    return bool(
+        with_own >= CONTRADICTION_MATCHES and with_scene < CONTRADICTION_SHARE * with_own
+    )
 
 
 def _has_little_evidence(F: Matrix3, own: Matrix3, pair: BatchPair) -> bool:

@@ -46,8 +46,12 @@ from mkpc_kaggle.scene.view_graph import (
 
 # Of a verified match; 1 px loses accuracy on tourist photographs, 4 px on repeated windows
 MAX_ERROR_PX = 2.0
-MAX_TRIALS = 300  # RANSAC trials per edge; more trials find the same inliers at five times the cost
-TRACKS_PER_IMAGE = 200  # the longest ones, from which the global mapper starts in a large scene
+MAX_TRIALS = (
+    300  # RANSAC trials per edge; more trials find the same inliers at five times the cost
+)
+TRACKS_PER_IMAGE = (
+    200  # the longest ones, from which the global mapper starts in a large scene
+)
 # Of the models with shared intrinsics, as in COLMAP's global mapper
 MAX_REFINEMENTS = 5
 ADJUSTMENT_ITERATIONS = 50  # of each bundle adjustment of a refinement
@@ -181,7 +185,10 @@ def _write_images(
         camera = cameras[key]
         # The keypoints are in the table of keypoints.
         taken = pycolmap.Image(
-            name=image.name, camera_id=camera.camera_id, image_id=number, keypoints=np.zeros((0, 2))
+            name=image.name,
+            camera_id=camera.camera_id,
+            image_id=number,
+            keypoints=np.zeros((0, 2)),
         )
         database.write_image(taken, use_image_id=True)
         frame = pycolmap.Frame(frame_id=number, rig_id=camera.camera_id)
@@ -231,7 +238,9 @@ def verify(merged: MergedGraph, cameras: Sequence[Any], *, reuse: bool = False) 
     # COLMAP takes matches without motion for a watermark, but nearby views have many of these.
     settings = {"ransac": ransac, "min_num_inliers": MIN_MATCHES, "detect_watermark": False}
     options = pycolmap.TwoViewGeometryOptions(settings)
-    points = [keypoints.astype(np.float64) + COLMAP_CENTRE_PX for keypoints in merged.keypoints]
+    points = [
+        keypoints.astype(np.float64) + COLMAP_CENTRE_PX for keypoints in merged.keypoints
+    ]
     lenses = [_lens(camera) for camera in cameras]
 
     def estimate(number: int) -> None:
@@ -306,11 +315,16 @@ def _mapper_options(graph: ViewGraph, threads: int) -> Any:
     """Return the settings of the global mapper for a graph."""
     seed = {"random_seed": SEED}
     # Each part has a separate random generator.
-    parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
+    parts = dict.fromkeys(
+        ("rotation_averaging", "global_positioning", "retriangulation"), seed
+    )
     mapper = {**seed, "num_threads": threads, **parts}
     # With some known cameras, the others must still be refined: those are restored afterwards.
     if len(graph.known) == len(graph.images):
-        mapper["bundle_adjustment"] = {"refine_focal_length": False, "refine_extra_params": False}
+        mapper["bundle_adjustment"] = {
+            "refine_focal_length": False,
+            "refine_extra_params": False,
+        }
     return pycolmap.GlobalMapperOptions(mapper)
 
 
@@ -347,7 +361,11 @@ def _refine(cache: Any, former: Any, settings: Any) -> Any:
     )
     # Adjust cameras and points in turn with the choice of points, until the model has converged
     mapper.iterative_global_refinement(
-        MAX_REFINEMENTS, MIN_CHANGE, options, _least_squares(settings), settings.retriangulation
+        MAX_REFINEMENTS,
+        MIN_CHANGE,
+        options,
+        _least_squares(settings),
+        settings.retriangulation,
     )
     _filter_points(mapper.observation_manager, model, settings)
     mapper.adjust_global_bundle(options, settings.bundle_adjustment)
@@ -361,7 +379,10 @@ def _least_squares(settings: Any) -> Any:
     """Return the options of an adjustment while points come and go: least squares of all tracks; the
     robust loss comes last.
     """
-    solver = {"num_threads": settings.num_threads, "max_num_iterations": ADJUSTMENT_ITERATIONS}
+    solver = {
+        "num_threads": settings.num_threads,
+        "max_num_iterations": ADJUSTMENT_ITERATIONS,
+    }
     return pycolmap.BundleAdjustmentOptions(
         {"print_summary": False, "ceres": {"use_gpu": False, "solver_options": solver}}
     )
@@ -378,7 +399,9 @@ def _filter_points(observations: Any, model: Any, settings: Any) -> None:
     )
 
 
-def _reconstruction(mapped: Sequence[Any], graph: ViewGraph, config: SceneConfig) -> Reconstruction:
+def _reconstruction(
+    mapped: Sequence[Any], graph: ViewGraph, config: SceneConfig
+) -> Reconstruction:
     """Return pycolmap's models with the user's cameras, without implausible images."""
     given_cameras = known_by_name(graph)
     # In a large scene, points of two views are too many.
@@ -422,7 +445,8 @@ def sfm_model(found: Any, images: Iterable[tuple[Any, BatchImage]]) -> SfmModel:
 def points_of(found: Any) -> NDArray[np.float64]:
     """Return the finite points (P, 3) of pycolmap's model, the longest tracks first."""
     tracks = {
-        number: found.points3D[number].track.length() for number in sorted(found.point3D_ids())
+        number: found.points3D[number].track.length()
+        for number in sorted(found.point3D_ids())
     }
     # The sort is stable: of equally long tracks, the point with the lower id.
     longest_first = sorted(tracks, key=lambda number: -tracks[number])

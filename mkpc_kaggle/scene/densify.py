@@ -63,7 +63,9 @@ def extra_pairs_of(
     return [pair for _, pair in sorted(extra, key=lambda each: each[0])]
 
 
-def extra_pairs(image_count: int, pairs: Sequence[IndexPair], per_image: float) -> list[IndexPair]:
+def extra_pairs(
+    image_count: int, pairs: Sequence[IndexPair], per_image: float
+) -> list[IndexPair]:
     """Return extra pairs that give a batch ``per_image`` pairs per image, the most useful first.
 
     ``pairs`` are the existing pairs, in any order. Each step links the image in the fewest pairs to the image with

@@ -66,7 +66,9 @@ def shortlist(features: Sequence[Descriptors]) -> list[tuple[int, int]]:
 def _words(features: Sequence[Descriptors]) -> NDArray[np.float32]:
     """Return the words (W, 128) of VLAD."""
     share = max(1, MAX_TRAINING // max(1, len(features)))
-    training = np.concatenate([found[:: max(1, len(found) // share)] for found in features]) / SCALE
+    training = (
+        np.concatenate([found[:: max(1, len(found) // share)] for found in features]) / SCALE
+    )
     # Evenly spread over the images, so that each kind of image has words
     words = training[:: max(1, len(training) // WORDS)][:WORDS]
     if len(words):

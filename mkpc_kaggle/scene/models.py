@@ -86,7 +86,9 @@ def filter_models(models: Sequence[SfmModel]) -> tuple[SfmModel, ...]:
     """Remove implausible cameras, then models with too few images. Return the rest, the largest
     first.
     """
-    cleaned = [replace(model, images=tuple(filter(is_plausible, model.images))) for model in models]
+    cleaned = [
+        replace(model, images=tuple(filter(is_plausible, model.images))) for model in models
+    ]
     kept = [model for model in cleaned if len(model.images) >= MIN_IMAGES]
     return tuple(sorted(kept, key=lambda model: (-len(model.images), -len(model.points))))
 

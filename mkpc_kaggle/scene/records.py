@@ -58,7 +58,9 @@ class SceneRecord:
             images=sum(len(found.names) for found in reconstructions),
             registered=sum(found.registered for found in reconstructions),
             points=sum(len(model.points) for model in models),
-            reprojection_error=float(np.average(errors, weights=weights)) if models else np.nan,
+            reprojection_error=float(np.average(errors, weights=weights))
+            if models
+            else np.nan,
             failure="" if models else "; ".join(reasons) or NO_CAMERAS,
             cameras=[
                 _camera_row(number, image)

@@ -170,7 +170,9 @@ def refined_intrinsics(
     images: Sequence[BatchImage], models: Sequence[SfmModel]
 ) -> SharedIntrinsics:
     """Return the focal length of each image, by the largest model with an image of its size."""
-    focals = {each.image.size: each.focal for model in reversed(models) for each in model.images}
+    focals = {
+        each.image.size: each.focal for model in reversed(models) for each in model.images
+    }
     return {image.digest: focals[image.size] for image in images if image.size in focals}
 
 

@@ -14,7 +14,9 @@ from mkpc_kaggle.geometry.intrinsics import KnownCamera, Rows
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 
-MIN_MATCHES = 15  # of a connecting edge; also the minimum number of inliers of a verified edge
+MIN_MATCHES = (
+    15  # of a connecting edge; also the minimum number of inliers of a verified edge
+)
 # From units that make tracks; with fewer, a pair uses the matches of all units
 MIN_TRACK_MATCHES = 50
 # The support of an image is the number of inliers of its edge of this rank. A single edge may join
@@ -174,7 +176,9 @@ def known_by_name(graph: ViewGraph) -> dict[str, KnownCamera]:
     }
 
 
-def supported(ends: Sequence[tuple[int, int]], inliers: Sequence[int], share: float) -> list[bool]:
+def supported(
+    ends: Sequence[tuple[int, int]], inliers: Sequence[int], share: float
+) -> list[bool]:
     """Return for each edge if it has at least ``share`` of the support of both of its images.
 
     ``ends`` are the indices of an edge's images, ``inliers`` its verified matches. Two sides of a temple, or two
@@ -185,7 +189,9 @@ def supported(ends: Sequence[tuple[int, int]], inliers: Sequence[int], share: fl
     for images, count in zip(ends, inliers, strict=True):
         for image in images:
             counts[image].append(count)
-    support = {image: sorted(of_image)[-SUPPORT_RANK:][0] for image, of_image in counts.items()}
+    support = {
+        image: sorted(of_image)[-SUPPORT_RANK:][0] for image, of_image in counts.items()
+    }
     return [
         count >= share * max(support[image] for image in images)
         for images, count in zip(ends, inliers, strict=True)

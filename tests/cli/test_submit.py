@@ -47,7 +47,9 @@ def submit(test_dir: Path, output: Path, recipe: Path, *more: str) -> int:
     return run_command("submit", *paths, "--no-report", "--workers", 0, *more)
 
 
-def test_a_submission_is_made_resumed_and_made_again_from_nothing(demo, small_recipe, made, capsys):
+def test_a_submission_is_made_resumed_and_made_again_from_nothing(
+    demo, small_recipe, made, capsys
+):
     output, written, done = made
     assert done.returncode == 0, done.stderr
     assert "complete after" in done.stdout
@@ -80,7 +82,9 @@ def test_a_killed_run_resumes_and_ends_with_the_bytes_of_an_undisturbed_one(
 
 def test_a_limit_that_is_over_at_the_start_leaves_a_whole_file_and_a_message(demo, tmp_path):
     # Imports alone take longer than 0.1 s.
-    made = make(demo.test_dir, tmp_path / "submission.csv", "classical", "--time-limit", "0.1s")
+    made = make(
+        demo.test_dir, tmp_path / "submission.csv", "classical", "--time-limit", "0.1s"
+    )
     assert made.returncode == 1
     assert "the time limit passed before the first results were written" in made.stderr
     assert problem_of(tmp_path / "submission.csv", demo.test_dir) == ""

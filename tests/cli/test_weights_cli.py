@@ -40,7 +40,9 @@ def test_list_has_the_path_of_each_file_and_the_names_of_missing_ones(weights, c
     ]
 
 
-def test_verify_lists_refused_files_and_missing_ones_of_another_manifest_and_fails(weights, capsys):
+def test_verify_lists_refused_files_and_missing_ones_of_another_manifest_and_fails(
+    weights, capsys
+):
     verify = ("weights", "verify", "--weights", weights)
     assert run_command(*verify) == 0
     told = capsys.readouterr().out
@@ -53,7 +55,9 @@ def test_verify_lists_refused_files_and_missing_ones_of_another_manifest_and_fai
     assert run_command(*verify) == 1
     told = capsys.readouterr().out
     assert "4 files, 1 refused, 1 missing" in told
-    assert f"{len(DATA)} bytes, the manifest says {len(OTHER)}: cut off, or another file" in told
+    assert (
+        f"{len(DATA)} bytes, the manifest says {len(OTHER)}: cut off, or another file" in told
+    )
     assert "gone.safetensors  missing" in told
 
 

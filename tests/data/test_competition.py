@@ -32,7 +32,9 @@ def side(tmp_path):
             path = tmp_path / "test_images" / name
             path.parent.mkdir(exist_ok=True)
             path.touch()
-        (tmp_path / "test.csv").write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+        (tmp_path / "test.csv").write_text(
+            "\n".join([header, *rows]) + "\n", encoding="utf-8"
+        )
         return tmp_path
 
     return write
@@ -65,7 +67,11 @@ def test_pairs_and_columns_come_in_any_order_and_ids_are_text(side):
     images = ["1e3/NA.png", "1e3/0010.Jpg", "1e3/00.png", "1e3/0010.txt"]
     home = side(*rows, header="image_2_id,more,batch_id,image_1_id,sample_id", images=images)
     pairs = read_test_side(home)
-    assert [(pair.id, pair.group) for pair in pairs] == [("007", "1e3"), ("a", "b"), ("z", "b")]
+    assert [(pair.id, pair.group) for pair in pairs] == [
+        ("007", "1e3"),
+        ("a", "b"),
+        ("z", "b"),
+    ]
     assert [image.name for image in pairs[0].images] == ["NA.png", "0010.Jpg"]
     # A missing image costs its pairs, not the run.
     assert not pairs[1].images[0].is_file()
@@ -108,7 +114,9 @@ def test_a_directory_without_its_table_or_images_is_refused(side):
 
 
 # Ids become paths of images, and of files that a report writes.
-@pytest.mark.parametrize("name", ["", ".", "..", "../x", "/etc", "x\\y", "C:x", "a\x1bb", "a\x7f"])
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", "../x", "/etc", "x\\y", "C:x", "a\x1bb", "a\x7f"]
+)
 def test_an_id_that_is_not_a_plain_name_is_refused(side, name):
     for row in ("s,{},1,2", "s,b,{},2", "s,b,1,{}"):
         home = side("ok,b,1,2", row.format(name))
@@ -126,7 +134,9 @@ def test_a_train_side_is_read_with_its_cameras_and_its_scale(train):
     assert_array_equal([first.camera0.t, first.camera1.t], [[1, 0, 0], [0, 0, 0]])
 
 
-def test_pairs_below_the_covisibility_are_left_out_and_others_are_spread_over_the_table(train):
+def test_pairs_below_the_covisibility_are_left_out_and_others_are_spread_over_the_table(
+    train,
+):
     assert keys(*read_train_side(train)) == ["b-a", "c-a", "c-b", "d-b", "d-c"]
     assert keys(*read_train_side(train, min_covisibility=0.5)) == ["b-a", "c-b", "d-c"]
     assert len(keys(*read_train_side(train, min_covisibility=0))) == 6
@@ -136,9 +146,21 @@ def test_pairs_below_the_covisibility_are_left_out_and_others_are_spread_over_th
 
 
 TRAIN_REFUSALS = [  # file, text, its replacement, options, message
-    ("s/calibration.csv", "", "", {"scenes": ["s", "x"]}, "unknown scene 'x'; known: absent, s"),
+    (
+        "s/calibration.csv",
+        "",
+        "",
+        {"scenes": ["s", "x"]},
+        "unknown scene 'x'; known: absent, s",
+    ),
     ("s/calibration.csv", "", "", {"scenes": ["absent"]}, "calibration.csv: no such file"),
-    ("s/calibration.csv", "", "", {"min_covisibility": 1.1}, "covisibility.csv has no pair with"),
+    (
+        "s/calibration.csv",
+        "",
+        "",
+        {"min_covisibility": 1.1},
+        "covisibility.csv has no pair with",
+    ),
     (
         "s/calibration.csv",
         "2 0 1 0 2 1 0 0 1",
@@ -153,7 +175,9 @@ TRAIN_REFUSALS = [  # file, text, its replacement, options, message
 
 
 @pytest.mark.parametrize(("file", "old", "new", "options", "says"), TRAIN_REFUSALS)
-def test_a_train_side_that_cannot_be_read_is_refused_by_file(train, file, old, new, options, says):
+def test_a_train_side_that_cannot_be_read_is_refused_by_file(
+    train, file, old, new, options, says
+):
     text = (train / file).read_text()
     assert old in text
     (train / file).write_text(text.replace(old, new))
@@ -196,8 +220,14 @@ def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):
             "sample_id,fundamental_matrix\na,{F}\nb,{F}\nc,{F}\n",
             "line 4: the sample is c, and no more rows was expected",
         ),
-        ("sample_id,fundamental_matrix\nb,{F}\na,{F}\n", "line 2: the sample is b, and a was"),
-        ("sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8 nan\n", "line 3: expected 9"),
+        (
+            "sample_id,fundamental_matrix\nb,{F}\na,{F}\n",
+            "line 2: the sample is b, and a was",
+        ),
+        (
+            "sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8 nan\n",
+            "line 3: expected 9",
+        ),
         (
             "sample_id,fundamental_matrix\na,{F}\nb,0 0 0 0 0 0 0 0 0\n",
             "line 3: the matrix is zero",
@@ -280,5 +310,7 @@ def test_numbers_are_read_strictly_in_each_table(tmp_path, train, number):
         f'a,"{matrix}",1 0 0 0 1 0 0 0 1,0 0 0\n',
         encoding="utf-8",
     )
-    with pytest.raises(UserError, match=r"calibration\.csv, line .*expected 9 finite numbers"):
+    with pytest.raises(
+        UserError, match=r"calibration\.csv, line .*expected 9 finite numbers"
+    ):
         read_train_side(train)

@@ -74,7 +74,9 @@ def test_a_file_that_is_not_a_picture_has_its_reason(tmp_path):
     bands = ImageFileDirectory_v2()
     bands.update({0x0102: (16,) * 5, 0x0115: 5})
     (tmp_path / "bands.tif").write_bytes(b"II*\0\x08\0\0\0" + bands.tobytes(8))
-    assert reason(tmp_path / "bands.tif").startswith("a TIFF file of another kind than 1, 3 or 4 ")
+    assert reason(tmp_path / "bands.tif").startswith(
+        "a TIFF file of another kind than 1, 3 or 4 "
+    )
     # The limit is 32 : 1.
     long = "300 x 3 pixels: one side is more than 32 times the other"
     assert reason(write(tmp_path / "line.png", noise(3, 300))) == long
@@ -110,7 +112,9 @@ def decoded(monkeypatch):
     def fake(path):
         seen.append(path)
         pixels = np.zeros((10, 10, 3), np.uint8)
-        return Unreadable(str(path), "bad") if path.name == "bad" else Image(str(path), pixels)
+        return (
+            Unreadable(str(path), "bad") if path.name == "bad" else Image(str(path), pixels)
+        )
 
     monkeypatch.setattr(images, "read_image", fake)
     return seen
@@ -231,7 +235,9 @@ RECORDED = {
 
 
 @pytest.mark.parametrize(("recorded", "expected"), RECORDED.values(), ids=RECORDED)
-def test_a_focal_length_by_the_sensor_is_that_of_the_stored_pixels(tmp_path, recorded, expected):
+def test_a_focal_length_by_the_sensor_is_that_of_the_stored_pixels(
+    tmp_path, recorded, expected
+):
     path = set_exif(write(tmp_path / "a.jpg", PIXELS), 1, **PLANE, **recorded)
     assert read_image(path).focal == pytest.approx(expected)
 

@@ -35,7 +35,13 @@ def test_durations_are_read(text: str, seconds: float) -> None:
 def test_the_four_moments_of_a_budget_follow_each_other() -> None:
     for limit in (10.0, 60.0, 31500.0):
         budget = Budget(0.0, limit, lambda: 0.0)
-        moments = [0.0, budget.stop_units, budget.stop_waiting, budget.final_write, budget.limit]
+        moments = [
+            0.0,
+            budget.stop_units,
+            budget.stop_waiting,
+            budget.final_write,
+            budget.limit,
+        ]
         # No two are equal: each moment leaves time for the work of the next.
         assert moments == sorted(set(moments))
         assert budget.left() == budget.stop_units

@@ -153,13 +153,15 @@ def test_each_candidate_has_its_files_of_colmap_and_one_without_them_is_made_aga
     def ask() -> str:
         matcher = SyntheticMatcher(images=4)
         assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")
-        session = Session(tmp_path / "work", Budget(time.monotonic()), Interrupt(), progress=False)
+        session = Session(
+            tmp_path / "work", Budget(time.monotonic()), Interrupt(), progress=False
+        )
         report = run_pairs(pairs, assembly, session, scenes_dir=scenes)
         assert report.scenes["candidate"].tolist() == [units[1].name]
         with Store.read(tmp_path / "work") as store:
-            ((_, key, _),) = json.loads(store.db.execute("SELECT about FROM run").fetchone()[0])[
-                "scenes"
-            ]
+            ((_, key, _),) = json.loads(
+                store.db.execute("SELECT about FROM run").fetchone()[0]
+            )["scenes"]
         return key
 
     key = ask()

@@ -24,7 +24,8 @@ def test_the_forms_of_the_option_are_read(text: str, meant: int | str) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["-1", "1000", "two", "ray:", "ray://", "ray://host", "ray://host:port", "ssh://host:1"]
+    "text",
+    ["-1", "1000", "two", "ray:", "ray://", "ray://host", "ray://host:port", "ssh://host:1"],
 )
 def test_other_forms_are_refused_with_the_known_ones(text: str) -> None:
     with pytest.raises(UserError) as refusal:
@@ -41,5 +42,9 @@ def test_without_ray_the_message_says_how_to_install_it(
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UserError, match=r'pip install "mkpc-kaggle\[ray\]"'):
         run(
-            write_pairs(tmp_path, 1), THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers="ray"
+            write_pairs(tmp_path, 1),
+            THREE_UNITS,
+            RectifiedMatcher(),
+            tmp_path / "w",
+            workers="ray",
         )

@@ -44,9 +44,7 @@ def test_each_error_is_a_kind_of_failure_by_its_text():
     import torch
 
     # PyTorch has one class, RuntimeError, for most errors of a device: only the text differs.
-    cuda = (
-        "CUDA error: {}\nCUDA kernel errors might be asynchronously reported at some other API call"
-    )
+    cuda = "CUDA error: {}\nCUDA kernel errors might be asynchronously reported at some other API call"
     messages = {
         FailureKind.OUT_OF_MEMORY: [
             "[enforce fail at alloc_cpu.cpp:117] err == 0. DefaultCPUAllocator: can't allocate memory",
@@ -58,7 +56,9 @@ def test_each_error_is_a_kind_of_failure_by_its_text():
         FailureKind.DEVICE: [
             cuda.format("an illegal memory access was encountered"),
             cuda.format("no kernel image is available for execution on the device"),
-            cuda.format("CUBLAS_STATUS_EXECUTION_FAILED when calling `cublasSgemm( handle )`"),
+            cuda.format(
+                "CUBLAS_STATUS_EXECUTION_FAILED when calling `cublasSgemm( handle )`"
+            ),
             "cuDNN error: CUDNN_STATUS_EXECUTION_FAILED",
             "No CUDA GPUs are available",
         ],
@@ -100,7 +100,10 @@ def assert_as_if_nothing_had_failed(report: Results, undisturbed: Results) -> No
     "gpus",
     [
         # A broken CUDA context stays broken: each GPU fails from some pair on.
-        [RectifiedMatcher(matches=breaks_after(2)), RectifiedMatcher(matches=breaks_after(3))],
+        [
+            RectifiedMatcher(matches=breaks_after(2)),
+            RectifiedMatcher(matches=breaks_after(3)),
+        ],
         [RectifiedMatcher(matches=lambda _: exhaust_gpu())],
     ],
 )
@@ -164,7 +167,9 @@ def test_a_pair_that_spoils_its_process_costs_no_other_pair_a_unit(
     def started() -> Pipeline:
         matcher = PoisonedMatcher(first=first, seconds=0.002)
         load = {matcher.name: matcher}.__getitem__
-        return Pipeline(THREE_UNITS, load, minibatch=minibatch, synchronise=matcher.synchronise)
+        return Pipeline(
+            THREE_UNITS, load, minibatch=minibatch, synchronise=matcher.synchronise
+        )
 
     cpu = RectifiedMatcher()
     places = [thread_place(f"cuda:{n}", cpu, pipeline=started) for n in range(gpus)]
@@ -240,11 +245,20 @@ def test_a_run_that_failed_has_exit_status_one_and_a_line(
     made = assemble(THREE_UNITS, matchers={matcher.name: matcher}, device="cpu")
     monkeypatch.setattr(options, "assemble", lambda *_, **__: made)
     output = tmp_path / "submission.csv"
-    command = ["submit", "--test-dir", str(demo.test_dir), "--output", str(output), "--no-report"]
+    command = [
+        "submit",
+        "--test-dir",
+        str(demo.test_dir),
+        "--output",
+        str(output),
+        "--no-report",
+    ]
     assert main(command) == 1
     assert f"the run failed: {told}" in capsys.readouterr().out
     # Failed, but complete: on Kaggle a file with fallback rows still scores.
-    assert submission_problem(output, [pair.id for pair in read_test_side(demo.test_dir)]) == ""
+    assert (
+        submission_problem(output, [pair.id for pair in read_test_side(demo.test_dir)]) == ""
+    )
 
 
 @pytest.mark.parametrize(
@@ -290,7 +304,11 @@ def test_a_matcher_that_a_worker_cannot_load_costs_its_units_alone_and_is_told_o
         thread_place("cpu", RectifiedMatcher(), pipeline=partial(Pipeline, recipe, load)),
     )
     report = run(
-        pairs, recipe, RectifiedMatcher(), tmp_path / "work", more=[RectifiedMatcher(name="broken")]
+        pairs,
+        recipe,
+        RectifiedMatcher(),
+        tmp_path / "work",
+        more=[RectifiedMatcher(name="broken")],
     )
     assert_as_if_nothing_had_failed(report, undisturbed)
     assert report.about.faults == [f"broken is left out: {told}"]
@@ -306,7 +324,9 @@ def test_a_worker_that_cannot_be_started_again_ends_the_run_with_all_rows(run_at
         made.append(broken)
         if len(made) > 1:
             raise UserError("the weights are gone")
-        return Pipeline.of(assemble(THREE_UNITS, matchers={broken.name: broken}, device="cpu"))
+        return Pipeline.of(
+            assemble(THREE_UNITS, matchers={broken.name: broken}, device="cpu")
+        )
 
     report = run_at(thread_place("cpu", broken, pipeline=once))
     assert report.ending is Ending.NO_WORKER

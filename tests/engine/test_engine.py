@@ -45,7 +45,9 @@ def after_calls(count: int, act: Callable[[], None]) -> Callable[[int], int]:
 
 
 def test_a_run_without_a_limit_gives_every_pair_every_unit(tmp_path):
-    report = run(write_pairs(tmp_path, 11), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    report = run(
+        write_pairs(tmp_path, 11), THREE_UNITS, RectifiedMatcher(), tmp_path / "work"
+    )
     assert report.ending is Ending.COMPLETE
     assert units(report) == [[SWEEP.name, SECOND.name, THIRD.name]] * 11
     pairs = report.pairs
@@ -55,7 +57,9 @@ def test_a_run_without_a_limit_gives_every_pair_every_unit(tmp_path):
     assert (pairs["inliers"] == pairs["matches"]).all()
     for own in pairs["own"]:
         F = np.reshape(own, (3, 3))
-        np.testing.assert_allclose(np.abs(F[1:, 1:]), [[0, 0.5**0.5], [0.5**0.5, 0]], atol=2e-3)
+        np.testing.assert_allclose(
+            np.abs(F[1:, 1:]), [[0, 0.5**0.5], [0.5**0.5, 0]], atol=2e-3
+        )
     assert all(match.regions for match in report.matches(*pairs["pair"]))
 
 

@@ -38,11 +38,16 @@ class NoMatcher(RectifiedMatcher):
 
 
 def submission(
-    pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, matcher: RectifiedMatcher | None = None
+    pairs: Sequence[Pair],
+    recipe: Recipe,
+    work_dir: Path,
+    matcher: RectifiedMatcher | None = None,
 ):
     """The bytes of the file, and the report."""
     output = work_dir.with_suffix(".csv")
-    report = run(pairs, recipe, matcher or SyntheticMatcher(images=4), work_dir, output=output)
+    report = run(
+        pairs, recipe, matcher or SyntheticMatcher(images=4), work_dir, output=output
+    )
     assert report.ending is Ending.COMPLETE
     return output.read_bytes(), report
 
@@ -72,7 +77,9 @@ def test_a_run_resumed_with_another_estimation_ends_with_the_bytes_of_a_fresh_on
     assert "0 units run, 6 F estimated" in summary(report)
 
 
-def die_at_a_write(pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, *, after: bool) -> None:
+def die_at_a_write(
+    pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, *, after: bool
+) -> None:
     """Resume a run, and kill this process at the first write of an estimate or a scene: before it,
     or after it.
     """
@@ -90,7 +97,9 @@ def die_at_a_write(pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, *, aft
 
 
 @pytest.mark.parametrize("kills", [2, pytest.param(10, marks=pytest.mark.slow)])
-def test_a_run_that_is_killed_while_it_estimates_again_ends_with_the_same_bytes(tmp_path, kills):
+def test_a_run_that_is_killed_while_it_estimates_again_ends_with_the_same_bytes(
+    tmp_path, kills
+):
     # 36 pairs are five jobs and a scene: each second kill leaves one of them done.
     images = 9 if kills > 2 else 4
     pairs = synthetic_pairs(tmp_path / "images", images)

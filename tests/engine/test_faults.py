@@ -66,7 +66,9 @@ def test_a_worker_lost_once_costs_time_alone(pairs, undisturbed, tmp_path, fault
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(tmp_path, monkeypatch, number):
+def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(
+    tmp_path, monkeypatch, number
+):
     pairs = write_pairs(tmp_path / "images", 12)
     run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     first = iter([number])
@@ -86,7 +88,9 @@ def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(tmp_path, monkey
     for path in (tmp_path / "images").iterdir():
         os.utime(path, (0, 0))
     with interruptible() as interrupt:
-        report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", interrupt=interrupt)
+        report = run(
+            pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", interrupt=interrupt
+        )
     assert digested == [], "the run ends before that digest"
     released.set()
     assert (report.ending, interrupt.signal) == (Ending.INTERRUPTED, number)
@@ -107,7 +111,13 @@ def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(
 
     monkeypatch.setattr(Run, "_save_points", fail_later)
     with pytest.raises(KeyError, match="a bug"):
-        run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=published.append)
+        run(
+            pairs,
+            THREE_UNITS,
+            RectifiedMatcher(),
+            tmp_path / "work",
+            publish=published.append,
+        )
     assert len(published[-1].written[1]) == 12
     with Store.read(tmp_path / "work") as store:
         has_units = results_of(store).pairs["units"] > 0
@@ -146,7 +156,9 @@ def test_a_submission_that_the_disk_refuses_is_reported_and_the_exit_status_is_o
     output = tmp_path / "submission.csv"
     assert main(["submit", *arguments_of(demo, small_recipe, output), "--workers", "0"]) == 1
     assert "is not the last version" in capsys.readouterr().out
-    assert submission_problem(output, [pair.id for pair in read_test_side(demo.test_dir)]) == ""
+    assert (
+        submission_problem(output, [pair.id for pair in read_test_side(demo.test_dir)]) == ""
+    )
 
 
 def arguments_of(demo: DemoSet, recipe: Path, output: Path) -> list[str]:
@@ -161,7 +173,9 @@ def arguments_of(demo: DemoSet, recipe: Path, output: Path) -> list[str]:
     ]
 
 
-def on_a_terminal(command: list[str], *, is_stopped: bool = False, is_read: bool = False) -> int:
+def on_a_terminal(
+    command: list[str], *, is_stopped: bool = False, is_read: bool = False
+) -> int:
     """On a terminal that is stopped, as after Ctrl-S, or that goes away, where ``is_read`` with its
     first text.
     """
@@ -169,7 +183,9 @@ def on_a_terminal(command: list[str], *, is_stopped: bool = False, is_read: bool
     # From now on each write to the terminal blocks.
     if is_stopped:
         termios.tcflow(its, termios.TCOOFF)
-    running = subprocess.Popen(command, stdin=its, stdout=its, stderr=its, start_new_session=True)
+    running = subprocess.Popen(
+        command, stdin=its, stdout=its, stderr=its, start_new_session=True
+    )
     os.close(its)
     if is_stopped:
         running.wait()
@@ -277,7 +293,9 @@ def test_a_parent_killed_at_any_moment_leaves_a_complete_file_no_orphans_and_a_r
     rng = random.Random(moments)
     environment = {**os.environ, "MKPC_TEST": str(tmp_path)}
     for _ in range(moments):
-        running = subprocess.Popen([sys.executable, str(script), str(tmp_path)], env=environment)
+        running = subprocess.Popen(
+            [sys.executable, str(script), str(tmp_path)], env=environment
+        )
         # From the imports to the last pair
         time.sleep(rng.uniform(0.5, 5.0))
         running.send_signal(signal.SIGKILL)
@@ -344,9 +362,7 @@ def test_the_watchdog_exits_even_if_writing_hangs_with_the_status_of_the_run(bod
 
 def test_the_watchdog_leaves_no_unfinished_file(tmp_path):
     report = f"replacing(Path({str(tmp_path / 'report.html')!r}))"
-    body = (
-        f"from mkpc_kaggle.data.outputs import replacing, Path; open = {report}; open.__enter__()"
-    )
+    body = f"from mkpc_kaggle.data.outputs import replacing, Path; open = {report}; open.__enter__()"
     assert stuck(f"session.save = lambda: ''; {body}").returncode == 0
     assert list(tmp_path.iterdir()) == []
 
@@ -379,11 +395,17 @@ def test_a_full_disk_for_the_journal_alone_is_exit_status_one(
     assert main(["submit", *arguments_of(demo, small_recipe, output), "--workers", "0"]) == 1
     said = capsys.readouterr().out
     assert "the journal cannot be written (database or disk is full)" in said
-    assert submission_problem(output, [pair.id for pair in read_test_side(demo.test_dir)]) == ""
+    assert (
+        submission_problem(output, [pair.id for pair in read_test_side(demo.test_dir)]) == ""
+    )
 
 
 def small_store(
-    pages: int, directory: Path, *, opened: Callable[..., Store] = Store.open, fresh: bool = False
+    pages: int,
+    directory: Path,
+    *,
+    opened: Callable[..., Store] = Store.open,
+    fresh: bool = False,
 ) -> Store:
     """Open a store whose file cannot grow beyond its present size and these pages."""
     store = opened(directory, fresh=fresh)

@@ -43,5 +43,7 @@ def test_tables_without_rows_have_their_columns(work):
         "focal",
     ]
     assert tables.cameras.query("focal > 0").empty
-    joined = tables.pairs.merge(tables.cameras, left_on="image0", right_on="image", how="left")
+    joined = tables.pairs.merge(
+        tables.cameras, left_on="image0", right_on="image", how="left"
+    )
     assert joined["focal"].isna().all()

@@ -52,7 +52,9 @@ def test_estimates_and_scenes_have_a_digest_of_their_settings(
         ("aliked-n16", [False, True, True]),
     ],
 )
-def test_other_weights_change_the_points_of_their_units_and_of_stage_2(monkeypatch, slot, changed):
+def test_other_weights_change_the_points_of_their_units_and_of_stage_2(
+    monkeypatch, slot, changed
+):
     units = (
         Unit(1, "xfeat_lighterglue", 640),
         Unit(1, "aliked_lightglue", 640),
@@ -86,7 +88,13 @@ def test_other_weights_change_the_points_of_their_units_and_of_stage_2(monkeypat
 def test_another_version_of_a_library_changes_the_points_that_come_from_it(
     monkeypatch, package, changed
 ):
-    names = ("sift", "sift_lightglue", "disk_lightglue", "xfeat_lighterglue", "aliked_lightglue")
+    names = (
+        "sift",
+        "sift_lightglue",
+        "disk_lightglue",
+        "xfeat_lighterglue",
+        "aliked_lightglue",
+    )
     units = tuple(Unit(1, name, 640) for name in names)
     made = replace(assemble(CLASSICAL), recipe=replace(CLASSICAL, units=units))
     monkeypatch.setattr(Assembly, "weight_files", {})
@@ -116,7 +124,9 @@ OTHERS = {
 
 @pytest.mark.parametrize(("other", "changed"), OTHERS.values(), ids=OTHERS)
 def test_a_key_is_the_digest_of_all_inputs_of_a_result(other, changed):
-    def chain(digest="d", first="", turns=(0, 0), first_is_last=False, **settings) -> list[str]:
+    def chain(
+        digest="d", first="", turns=(0, 0), first_is_last=False, **settings
+    ) -> list[str]:
         keys = Keys(("u", "v"), **{"mkpc": "m", "estimate": "e", "scene": "s"} | settings)
         pair = Pair("p", "b", "0.png", "1.png", turns)
         first_image, second_image = IMAGES

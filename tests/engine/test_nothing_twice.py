@@ -65,7 +65,15 @@ class Room:
 
     def command(self, output: str) -> list[str]:
         files = ["--test-dir", str(self.home / "test"), "--output", str(self.home / output)]
-        return ["submit", *files, "--recipe", str(self.recipe), "--no-report", "--workers", "0"]
+        return [
+            "submit",
+            *files,
+            "--recipe",
+            str(self.recipe),
+            "--no-report",
+            "--workers",
+            "0",
+        ]
 
     def run(self, output: str = "a.csv") -> bytes:
         assert main(self.command(output)) == 0
@@ -132,7 +140,10 @@ CHANGES: dict[str, tuple[Callable[[Room], None], Callable[[Room], int]]] = {
         lambda room: 2 * BEFORE,
     ),
     "rows added": (lambda room: room.rows(8), lambda room: 4),
-    "an image replaced": (replace_an_image, lambda room: 2 * rows_of(room, rarest_image(room)[1])),
+    "an image replaced": (
+        replace_an_image,
+        lambda room: 2 * rows_of(room, rarest_image(room)[1]),
+    ),
 }
 
 
@@ -218,7 +229,9 @@ def test_ten_kills_after_a_change_leave_the_same_bytes(room: Room, change: str) 
     make(room)
     # From the imports to the report
     for _ in range(10):
-        running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        running = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         time.sleep(rng.uniform(0.5, 6.0))
         os.kill(running.pid, signal.SIGKILL)
         running.wait()

@@ -156,7 +156,8 @@ def test_near_the_end_a_minibatch_gets_as_small_as_the_time_that_is_left():
     run = Planned(30, limit=100.0, had=[(SWEEP,)] * 30, minibatch=8)
     run.learn(*UNITS)
     sizes = [
-        len(run.plan(run.plan().left - left).match.pairs) for left in (50.0, 9.5, 8.5, 5.5, 1.5)
+        len(run.plan(run.plan().left - left).match.pairs)
+        for left in (50.0, 9.5, 8.5, 5.5, 1.5)
     ]
     assert sizes == [8, 8, 8, 5, 1]
 
@@ -178,7 +179,11 @@ def test_a_suspect_is_alone_in_its_job_and_comes_last():
     run.state.losses[0, 1] = 1
     jobs = [run.next() for _ in range(3)]
     # Another loss then has one cause.
-    assert [(job.pairs, job.units) for job in jobs] == [([1], [1, 2]), ([2], [1, 2]), ([0], [1])]
+    assert [(job.pairs, job.units) for job in jobs] == [
+        ([1], [1, 2]),
+        ([2], [1, 2]),
+        ([0], [1]),
+    ]
 
 
 def test_a_place_that_lost_jobs_continues_elsewhere_with_one_unit():
@@ -190,7 +195,9 @@ def test_a_place_that_lost_jobs_continues_elsewhere_with_one_unit():
     assert [len(job.units) * len(job.pairs) for job in jobs[1:]] == [1, 1, 1]
 
 
-def test_a_part_of_many_due_estimates_is_handed_out_and_nothing_forgets_the_others(monkeypatch):
+def test_a_part_of_many_due_estimates_is_handed_out_and_nothing_forgets_the_others(
+    monkeypatch,
+):
     monkeypatch.setattr(plan_module, "MAX_DUE", 3)
     run = Planned(count=8, had=[UNITS] * 8)
     due = []
@@ -202,7 +209,9 @@ def test_a_part_of_many_due_estimates_is_handed_out_and_nothing_forgets_the_othe
 
 
 @pytest.mark.parametrize("reserve", [0, 100])
-def test_a_unit_begins_only_if_it_ends_before_the_time_reserved_for_estimates_and_scenes(reserve):
+def test_a_unit_begins_only_if_it_ends_before_the_time_reserved_for_estimates_and_scenes(
+    reserve,
+):
     run = Planned(3, limit=100.0, had=[(SWEEP,)] * 3)
     run.learn(*UNITS)
     # Three estimates of 5 s are more than the 10 s before the end.
@@ -356,7 +365,9 @@ def test_a_lost_job_comes_back_as_single_units_and_a_unit_lost_twice_is_skipped_
 def test_a_unit_that_never_ran_is_skipped_on_all_pairs_after_two():
     ran = simulate(Scenario(200, (1.0,) * 3, 1, math.inf, misses=0, never="m1"))
     # On each pair it would cost two workers.
-    assert explained(ran.report.about.faults, "2:m1@100 is skipped on all pairs: it never ran")
+    assert explained(
+        ran.report.about.faults, "2:m1@100 is skipped on all pairs: it never ran"
+    )
     assert units_of(ran) == 400
     assert ran.closed == ()
     assert ran.report.ending is Ending.WITH_FAILURES
@@ -387,6 +398,8 @@ def test_a_place_that_fails_is_closed_and_its_pairs_are_matched_elsewhere(broken
     assert ran.given_up == ()
     assert units_of(ran) == 600
     # All of them: the CPU takes over.
-    alone = simulate(replace(scenario, workers=1, fallback=True, limit=3000.0, broken=broken / 3))
+    alone = simulate(
+        replace(scenario, workers=1, fallback=True, limit=3000.0, broken=broken / 3)
+    )
     assert alone.on_fallback > 0
     assert units_of(alone) == 600

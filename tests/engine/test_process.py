@@ -55,7 +55,9 @@ def start() -> Iterator[Callable[..., Worker]]:
     """Starts a worker. In the end it is killed, and neither its thread nor its process is left."""
     workers = []
 
-    def start(make: Callable[[SceneJob], Solution] = choose_scene_for_all_but_the_first) -> Worker:
+    def start(
+        make: Callable[[SceneJob], Solution] = choose_scene_for_all_but_the_first,
+    ) -> Worker:
         workers.append(Worker(make))
         workers[-1].start()
         return workers[-1]

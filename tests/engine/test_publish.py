@@ -24,7 +24,9 @@ def estimate_wrongly(F: np.ndarray, job: EstimateJob) -> tuple[Estimated, ...]:
     [np.zeros((3, 3)), np.full((3, 3), np.nan), np.full((3, 3), np.inf), np.eye(3)],
     ids=["zeros", "NaN", "infinite", "rank 3"],
 )
-def test_a_matrix_that_is_no_f_becomes_the_fallback_and_the_file_is_valid(tmp_path, monkeypatch, F):
+def test_a_matrix_that_is_no_f_becomes_the_fallback_and_the_file_is_valid(
+    tmp_path, monkeypatch, F
+):
     pairs = write_pairs(tmp_path / "images", 1)
     make = partial(runner, partial(estimate_wrongly, F))
     monkeypatch.setattr(places, "estimates_runner", lambda **_: make())

@@ -28,7 +28,9 @@ TESTS = Path(__file__).parents[1]
 IMPORTED = [str(TESTS.parent), str(TESTS / "engine"), str(TESTS / "support")]
 
 
-ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mkpc-kaggle[ray]'")
+ray = pytest.importorskip(
+    "ray", reason="Ray is not installed: pip install 'mkpc-kaggle[ray]'"
+)
 
 
 TESTS = Path(__file__).parents[1]
@@ -75,7 +77,9 @@ def test_actors_give_the_bytes_of_a_run_in_one_process_though_an_actor_dies(
     cluster, pairs, undisturbed, tmp_path
 ):
     matcher = FaultyMatcher(fault=die, once=tmp_path / "died")
-    report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=f"ray://{cluster.address}")
+    report = run(
+        pairs, THREE_UNITS, matcher, tmp_path / "w", workers=f"ray://{cluster.address}"
+    )
     assert report.ending is Ending.COMPLETE
     assert ["the worker died" in fault for fault in report.about.faults] == [True], (
         report.about.faults
@@ -84,7 +88,9 @@ def test_actors_give_the_bytes_of_a_run_in_one_process_though_an_actor_dies(
     assert not ray.is_initialized(), "the run lets go of the cluster"
 
 
-def test_a_machine_lost_during_the_run_costs_its_job_alone(cluster, pairs, undisturbed, tmp_path):
+def test_a_machine_lost_during_the_run_costs_its_job_alone(
+    cluster, pairs, undisturbed, tmp_path
+):
     lost = cluster.add_node(num_cpus=1, object_store_memory=STORE_BYTES)
     matcher = DoomedMatcher(node=lost.node_id, mark=tmp_path / "begun")
 
@@ -95,7 +101,9 @@ def test_a_machine_lost_during_the_run_costs_its_job_alone(cluster, pairs, undis
         cluster.remove_node(lost, allow_graceful=False)
 
     threading.Thread(target=lose, daemon=True).start()
-    report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=f"ray://{cluster.address}")
+    report = run(
+        pairs, THREE_UNITS, matcher, tmp_path / "w", workers=f"ray://{cluster.address}"
+    )
     assert report.ending is Ending.COMPLETE
     assert "a job was lost on machine " in report.about.faults[0]
     assert matrices(report) == matrices(undisturbed)

@@ -67,7 +67,10 @@ CHANGES = {
     "crops": (lambda room: room.ask(mkpc="other"), (2, 0, False)),
     "pair added": (lambda room: room.ask(pairs=FOUR), (2, 2, True)),
     "content": (lambda room: room.ask(contents={"0.png": "new"}), (1, 1, False)),
-    "content of second images": (lambda room: room.ask(contents={"c.png": "new"}), (0, 0, False)),
+    "content of second images": (
+        lambda room: room.ask(contents={"c.png": "new"}),
+        (0, 0, False),
+    ),
     "more points": (lambda room: room.match(2, SWEEP), (3, 2, False)),
 }
 
@@ -99,7 +102,9 @@ def test_a_later_unit_of_stage_1_changes_no_crop_and_one_that_comes_late_opens_i
     assert room.state.done[1].tolist() == [True, True, False]
 
 
-def test_a_crop_that_the_pair_does_not_need_is_judged_again_by_todays_rule(room: Room) -> None:
+def test_a_crop_that_the_pair_does_not_need_is_judged_again_by_todays_rule(
+    room: Room,
+) -> None:
     def ask(least: float) -> tuple[bool, bool]:
         mkpc = replace(RECIPE.mkpc, when=When.SCALE, min_scale=least)
         room.ask(replace(RECIPE, mkpc=mkpc))

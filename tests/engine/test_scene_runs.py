@@ -67,7 +67,9 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch
     assert len(match.results[0].matches), "pictures have points"
 
 
-def test_a_focal_length_of_exif_goes_to_the_pairs_the_store_and_the_scene(tmp_path, monkeypatch):
+def test_a_focal_length_of_exif_goes_to_the_pairs_the_store_and_the_scene(
+    tmp_path, monkeypatch
+):
     pairs = batch_pairs(tmp_path / "images", 3)
     jobs = list[SceneJob]()
 
@@ -144,7 +146,9 @@ def test_a_run_reconstructs_the_true_cameras_and_a_gigabyte_is_enough(tmp_path, 
     assert max(distances) < 0.5
 
 
-def test_a_death_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(tmp_path, monkeypatch):
+def test_a_death_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(
+    tmp_path, monkeypatch
+):
     # pycolmap reads its database there; a process that was killed cannot remove it.
     (tmp_path / "temporary").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
@@ -157,7 +161,9 @@ def test_a_death_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(tmp_p
     assert list((tmp_path / "temporary").iterdir()) == []
 
 
-def test_a_resumed_run_reconstructs_only_the_batch_whose_image_was_replaced(tmp_path, monkeypatch):
+def test_a_resumed_run_reconstructs_only_the_batch_whose_image_was_replaced(
+    tmp_path, monkeypatch
+):
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
     one = batch_pairs(tmp_path / "images")
     two = batch_pairs(tmp_path / "others", 3, "two")

@@ -20,7 +20,9 @@ def put(store: Store, *numbers: int) -> None:
 
 
 def keys_in(store: Store, count: int = 200) -> set[str]:
-    return {key for (key,) in store.select("result", "key", [f"key {n}" for n in range(count)])}
+    return {
+        key for (key,) in store.select("result", "key", [f"key {n}" for n in range(count)])
+    }
 
 
 def test_rows_are_saved_all_or_none(tmp_path: Path) -> None:

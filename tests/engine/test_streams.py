@@ -50,7 +50,9 @@ def test_output_of_native_code_in_a_worker_goes_to_a_file_of_the_run(tmp_path):
     command = [sys.executable, script, tmp_path / "workers.log"]
     done = subprocess.run(command, env=environment, capture_output=True, check=True)
     assert (done.stdout, done.stderr) == (b"", b"")
-    assert (tmp_path / "workers.log").read_bytes() == b"libpng warning, libjpeg: premature end"
+    assert (
+        tmp_path / "workers.log"
+    ).read_bytes() == b"libpng warning, libjpeg: premature end"
 
 
 UNREAD = """
@@ -71,7 +73,12 @@ def test_a_stderr_that_is_not_read_costs_lines_and_not_the_run():
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", UNREAD]
     done = subprocess.run(
-        command, stdout=subprocess.PIPE, stderr=pipe, env=environment, check=False, timeout=300
+        command,
+        stdout=subprocess.PIPE,
+        stderr=pipe,
+        env=environment,
+        check=False,
+        timeout=300,
     )
     os.close(pipe)
     os.close(reader)
@@ -104,7 +111,9 @@ def test_a_file_gets_a_line_when_a_count_begins_and_at_its_end(capsys):
     ]
 
 
-def test_a_log_file_has_all_messages_and_one_that_cannot_be_written_costs_nothing(tmp_path, capsys):
+def test_a_log_file_has_all_messages_and_one_that_cannot_be_written_costs_nothing(
+    tmp_path, capsys
+):
     for path in (tmp_path / LOG_NAME, tmp_path / "none" / LOG_NAME):
         with logged(path):
             logger.debug("sweep")

@@ -5,7 +5,13 @@ from typing import Any
 
 import pytest
 
-from mkpc_kaggle.engine.budget import COST_OF_ESTIMATES, Budget, Costs, start_limit, time_limit
+from mkpc_kaggle.engine.budget import (
+    COST_OF_ESTIMATES,
+    Budget,
+    Costs,
+    start_limit,
+    time_limit,
+)
 from mkpc_kaggle.engine.request import EstimateJob, Job, MatchJob, MatchPlan, SceneJob
 from mkpc_kaggle.recipe import Recipe, Unit
 
@@ -56,7 +62,9 @@ def test_a_warm_up_alone_is_no_measurement_and_is_allowed_again_after_one() -> N
     costs.observe(UNIT.name, 50.0, warm_up=True)
     assert limit_of(matching(1), costs) == limit_of(matching(1), Costs())
     costs.observe(UNIT.name, 1.0)
-    assert limit_of(matching(1), costs) == limit_of(matching(1), measured(UNIT.name, 1.0)) + 50
+    assert (
+        limit_of(matching(1), costs) == limit_of(matching(1), measured(UNIT.name, 1.0)) + 50
+    )
 
 
 @pytest.mark.parametrize("job", [matching(1), matching(64)], ids=["unit", "units"])
@@ -67,7 +75,9 @@ def test_a_job_of_unknown_cost_may_take_a_share_of_the_remaining_time(job: Job) 
     assert limit_of(job, Costs(), float("inf")) < 2 * 3600
 
 
-def test_a_first_estimate_that_hangs_takes_neither_an_hour_of_nine_nor_a_short_limit() -> None:
+def test_a_first_estimate_that_hangs_takes_neither_an_hour_of_nine_nor_a_short_limit() -> (
+    None
+):
     assert limit_of(estimates(8), Costs()) < 600
     assert limit_of(estimates(8), Costs(), 60.0) < 30
 

@@ -19,7 +19,9 @@ def job_of(pairs, plan):
     """A job of a plan on pairs whose images are as they are stored."""
     inputs = []
     for index, pair in enumerate(pairs):
-        images = [BatchImage(path.name, content_digest(path), Size(1, 1)) for path in pair.images]
+        images = [
+            BatchImage(path.name, content_digest(path), Size(1, 1)) for path in pair.images
+        ]
         inputs.append(PairInputs(index, pair, tuple(images), {}))
     return MatchJob(tuple(inputs), THREE_UNITS, Source(), plan)
 

@@ -13,7 +13,9 @@ from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.evaluation.validate import paired_difference
 
 PAIRS = [*combinations("abcdef", 2)]
-tenths = st.lists(st.integers(0, 10).map(lambda count: count / 10), min_size=1, max_size=len(PAIRS))
+tenths = st.lists(
+    st.integers(0, 10).map(lambda count: count / 10), min_size=1, max_size=len(PAIRS)
+)
 
 
 def test_scenes_have_equal_weights_regardless_of_their_number_of_pairs():
@@ -21,18 +23,26 @@ def test_scenes_have_equal_weights_regardless_of_their_number_of_pairs():
     small = ([0.0], [0.4], PAIRS[:1])
     difference = paired_difference([large, small])
     # Over the ten pairs, the mean would be 0.22.
-    assert (difference.gain, difference.low, difference.high) == pytest.approx((0.3, 0.3, 0.3))
+    assert (difference.gain, difference.low, difference.high) == pytest.approx(
+        (0.3, 0.3, 0.3)
+    )
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(tenths, min_size=1, max_size=3), st.randoms(use_true_random=False))
-def test_the_interval_holds_the_gain_and_changes_its_sign_with_exchanged_recipes(firsts, random):
-    scenes = [(first, random.sample(first, len(first)), PAIRS[: len(first)]) for first in firsts]
+def test_the_interval_holds_the_gain_and_changes_its_sign_with_exchanged_recipes(
+    firsts, random
+):
+    scenes = [
+        (first, random.sample(first, len(first)), PAIRS[: len(first)]) for first in firsts
+    ]
     one = paired_difference(scenes)
     assert one == paired_difference(scenes)
     assert one.low - 1e-9 <= one.gain <= one.high + 1e-9
     other = paired_difference([(second, first, images) for first, second, images in scenes])
-    assert (other.gain, other.low, other.high) == pytest.approx((-one.gain, -one.high, -one.low))
+    assert (other.gain, other.low, other.high) == pytest.approx(
+        (-one.gain, -one.high, -one.low)
+    )
 
 
 def test_95_percent_intervals_hold_the_true_gain_if_gains_depend_on_images():

@@ -66,7 +66,9 @@ def test_a_malformed_line_is_named_with_what_was_expected(line, expected):
 def test_no_name_leads_out_of_the_image_root(name):
     # Lists are downloaded files, and a report shows the images that they name.
     for names in (f"{name} ok.jpg", f"ok.jpg {name}"):
-        with pytest.raises(UserError, match=r"list.txt, line 7: .* points outside the image root"):
+        with pytest.raises(
+            UserError, match=r"list.txt, line 7: .* points outside the image root"
+        ):
             parse_line(f"{names} 0 0 {EYE}", *WHERE)
     pair = parse_line(f"a/b..c.jpg ./d.jpg 0 0 {EYE}", *WHERE).pair
     assert pair.images == (Path("images/a/b..c.jpg"), Path("images/d.jpg"))

@@ -8,7 +8,13 @@ from run_tables import Described, tables_of
 from shared import run_command, scores_of
 
 from mkpc_kaggle.data import competition
-from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, read_test_side, read_train_side
+from mkpc_kaggle.data.competition import (
+    Pair,
+    TrainScene,
+    TruePair,
+    read_test_side,
+    read_train_side,
+)
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.evaluation.validate import (
     SceneScore,
@@ -33,7 +39,8 @@ def true_matrices(demo: DemoSet) -> dict[str, np.ndarray]:
             cameras[second, first] = true.camera1, true.camera0
     rows = (line.split(",") for line in demo.truth_csv.read_text().splitlines()[1:])
     return {
-        sample: fundamental_of_cameras(*cameras[first, second]) for sample, _, first, second in rows
+        sample: fundamental_of_cameras(*cameras[first, second])
+        for sample, _, first, second in rows
     }
 
 
@@ -97,7 +104,12 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
 
 def on_demo(demo, recipe, *options):
     return scores_of(
-        recipe.with_suffix(".json"), "--train-dir", demo.train_dir, "--recipe", recipe, *options
+        recipe.with_suffix(".json"),
+        "--train-dir",
+        demo.train_dir,
+        "--recipe",
+        recipe,
+        *options,
     )
 
 
@@ -113,9 +125,13 @@ def test_each_step_of_the_estimate_has_a_column(demo, small_recipe, capsys):
     assert by_step["MAGSAC"] == pytest.approx(plain["mAA"])
     assert by_step["+ scene"] == scores["mAA"]
     # The table and the JSON file are written by two functions.
-    (row,) = (line.split() for line in printed.splitlines() if line.startswith("mean over scenes"))
+    (row,) = (
+        line.split() for line in printed.splitlines() if line.startswith("mean over scenes")
+    )
     assert row[4:7] == [f"{value:.4f}" for value in by_step.values()]
-    for pair, former in zip(scores["scenes"][0]["pairs"], plain["scenes"][0]["pairs"], strict=True):
+    for pair, former in zip(
+        scores["scenes"][0]["pairs"], plain["scenes"][0]["pairs"], strict=True
+    ):
         assert pair["accuracy_by_step"]["MAGSAC"] == former["accuracy_by_step"]["MAGSAC"]
 
 
@@ -134,7 +150,9 @@ def test_a_validation_that_hangs_ends_at_its_limit(demo):
     # 300 s are for the imports of a busy machine; the assertions do not depend on them.
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 1
-    assert done.stderr.endswith("error: the time limit passed before the scores were printed\n")
+    assert done.stderr.endswith(
+        "error: the time limit passed before the scores were printed\n"
+    )
 
 
 @pytest.mark.parametrize(

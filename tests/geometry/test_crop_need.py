@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from mkpc_kaggle.geometry.coordinates import Box, Size
-from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, RegionReason, When
+from mkpc_kaggle.geometry.critical_region import (
+    CriticalRegion,
+    MkpcConfig,
+    RegionReason,
+    When,
+)
 from mkpc_kaggle.geometry.crop_need import crop_need, scale_between
 from mkpc_kaggle.geometry.matches import Matches
 
@@ -20,7 +25,9 @@ def zoomed(factor, count=200, wrong=0, noise=0.5):
     rng = np.random.default_rng(count)
     points0 = rng.uniform((400, 320), (600, 480), (count, 2))
     turn = np.array([[np.cos(0.2), -np.sin(0.2)], [np.sin(0.2), np.cos(0.2)]])
-    points1 = (points0 - (500, 400)) * factor @ turn + (500, 400) + rng.normal(0, noise, (count, 2))
+    points1 = (
+        (points0 - (500, 400)) * factor @ turn + (500, 400) + rng.normal(0, noise, (count, 2))
+    )
     points1[:wrong] = rng.uniform((0, 0), SIZE, (wrong, 2))
     return Matches(points0, points1, np.ones(count))
 
@@ -29,7 +36,9 @@ def zoomed(factor, count=200, wrong=0, noise=0.5):
 def test_the_scale_is_that_of_the_images_in_either_order(factor, wrong):
     matches = zoomed(factor, wrong=wrong)
     other_way = Matches(matches.points1, matches.points0, matches.scores)
-    assert scale_between(matches, (SIZE, SIZE)) == pytest.approx(factor, rel=0.1 if wrong else 0.03)
+    assert scale_between(matches, (SIZE, SIZE)) == pytest.approx(
+        factor, rel=0.1 if wrong else 0.03
+    )
     assert scale_between(other_way, (SIZE, SIZE)) == pytest.approx(
         factor, rel=0.1 if wrong else 0.05
     )
@@ -69,4 +78,6 @@ def test_a_crop_is_needed_where_scales_differ_or_detail_comes_back(
     regions, scale, whole, crop, is_needed
 ):
     assert crop_need(regions, scale, whole, crop, BY_SCALE).is_needed is is_needed
-    assert crop_need(regions, scale, whole, crop, MkpcConfig()).is_needed, "the paper's: always"
+    assert crop_need(regions, scale, whole, crop, MkpcConfig()).is_needed, (
+        "the paper's: always"
+    )

@@ -159,7 +159,9 @@ def test_a_model_needs_one_match_more_than_its_minimum_else_the_fallback_is_give
 
 
 @pytest.mark.parametrize("model", ModelKind)
-def test_repeated_matches_do_not_change_the_model_and_non_finite_ones_are_never_inliers(model):
+def test_repeated_matches_do_not_change_the_model_and_non_finite_ones_are_never_inliers(
+    model,
+):
     matches, truth = scene(1, plane=model is ModelKind.H)
     clean = estimated(model, matches, seed=1)
     assert_agrees(clean, truth)
@@ -178,7 +180,9 @@ def test_repeated_matches_do_not_change_the_model_and_non_finite_ones_are_never_
 
 
 @pytest.mark.parametrize("model", ModelKind)
-def test_the_same_input_gives_the_same_bytes_after_other_calls_and_beside_other_threads(model):
+def test_the_same_input_gives_the_same_bytes_after_other_calls_and_beside_other_threads(
+    model,
+):
     plane = model is ModelKind.H
     config = RobustConfig(max_iterations=2000)
     inputs = [scene(seed, plane)[0] for seed in SEEDS] * 2
@@ -238,4 +242,6 @@ def test_a_matrix_of_rank_3_is_no_fundamental_matrix(monkeypatch):
     monkeypatch.setattr(robust.cv2, "findFundamentalMat", lambda *_, **__: (np.eye(3), mask))
     found = estimate(matches, DEFAULT)
     assert found.failure.startswith("no F fits 60 distinct matches")
-    assert_array_equal(found.matrix, FALLBACK_FUNDAMENTAL / np.linalg.norm(FALLBACK_FUNDAMENTAL))
+    assert_array_equal(
+        found.matrix, FALLBACK_FUNDAMENTAL / np.linalg.norm(FALLBACK_FUNDAMENTAL)
+    )

@@ -88,7 +88,10 @@ def attack(case: Case, room: Path) -> None:
         faults += _faults(case, status, output, room)
         faults += [f"left running: {line}" for line in _orphans(mark)]
         # A signal before the program reads its options leaves no file, and cannot.
-        was_interrupted = status not in (0, 1) and output.strip() in ("", "error: interrupted")
+        was_interrupted = status not in (0, 1) and output.strip() in (
+            "",
+            "error: interrupted",
+        )
         if (
             case.submission
             and not was_interrupted
@@ -101,7 +104,9 @@ def attack(case: Case, room: Path) -> None:
             faults += _result_faults(room / "out" / "o", status)
     after = _snapshot(room)
     faults += [
-        f"changed: {name}" for name in sorted(before | after) if before.get(name) != after.get(name)
+        f"changed: {name}"
+        for name in sorted(before | after)
+        if before.get(name) != after.get(name)
     ]
     if faults:
         lines = [case.id, case.command, *faults, f"output:\n{output[-3000:]}"]
@@ -156,7 +161,9 @@ def _wait(process: "subprocess.Popen[bytes]", room: Path) -> tuple[int | None, s
 
 
 def _faults(case: Case, status: int | None, output: str, room: Path) -> Iterator[str]:
-    yield from (f"the output has {crash!r}" for crash in (*CRASHES, *MISTYPED) if crash in output)
+    yield from (
+        f"the output has {crash!r}" for crash in (*CRASHES, *MISTYPED) if crash in output
+    )
     if status is None:
         yield f"it hangs: not over after {HANGS_S} s"
     elif status not in case.statuses:
@@ -165,7 +172,9 @@ def _faults(case: Case, status: int | None, output: str, room: Path) -> Iterator
         yield "refused without a word"
     if case.says not in output:
         yield f"the output has no {case.says!r}"
-    if status in (0, 1, 2) and (left := sorted(path.name for path in (room / "tmp").iterdir())):
+    if status in (0, 1, 2) and (
+        left := sorted(path.name for path in (room / "tmp").iterdir())
+    ):
         yield f"left in the folder for temporary files: {left}"
 
 
@@ -204,6 +213,8 @@ def _snapshot(room: Path) -> dict[str, tuple[object, ...]]:
         for name in folders + names:
             path = os.path.join(folder, name)  # noqa: PTH118  bytes: a name may be no text
             status = os.lstat(path)
-            contents = (status.st_size, status.st_mtime_ns, status.st_ino) if name in names else ()
+            contents = (
+                (status.st_size, status.st_mtime_ns, status.st_ino) if name in names else ()
+            )
             states[repr(path)] = (status.st_mode, *contents)
     return states

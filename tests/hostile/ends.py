@@ -17,7 +17,14 @@ SOON = (0.6, 1.5, 3.0, 6.0)  # Python itself takes 0.1 s to start, more on a bus
 ENDS = {"SIGINT": 130, "SIGTERM": 143}
 STATUSES = {name: (0, status, -status + 128) for name, status in ENDS.items()}
 # Signals that the program does not handle: the kernel ends it, and the next run must resume.
-CRUEL = {"SIGKILL": -9, "SIGHUP": -1, "SIGQUIT": -3, "SIGUSR1": -10, "SIGXCPU": -24, "SIGSEGV": -11}
+CRUEL = {
+    "SIGKILL": -9,
+    "SIGHUP": -1,
+    "SIGQUIT": -3,
+    "SIGUSR1": -10,
+    "SIGXCPU": -24,
+    "SIGSEGV": -11,
+}
 AGAIN = SUBMIT.replace("quick.toml", "classical")
 WORKING = f"{WITHOUT_LIMIT.replace('quick.toml', 'classical')} --workers"
 
@@ -38,7 +45,9 @@ def sends(name: str, *after: float, group: bool = False) -> Act:
 def signals() -> Iterator[Case]:
     for name in ENDS:
         acts = {f"after {after} s": sends(name, after) for after in SOON}
-        acts |= {f"to all after {after} s": sends(name, after, group=True) for after in SOON[::2]}
+        acts |= {
+            f"to all after {after} s": sends(name, after, group=True) for after in SOON[::2]
+        }
         acts["twice"] = sends(name, 3.0, 0.2)
         for when, act in acts.items():
             yield Case(
@@ -61,7 +70,10 @@ CASES = [
     *options("limits", LIMITED, {f"--time-limit {value}": value for value in SHORT}, (0, 1)),
     *options("limits", LIMITED, {f"--time-limit {value}": value for value in LONG}, (0,)),
     *options(
-        "limits", WORKING, {f"5s with {n} workers": f"{n} --time-limit 5s" for n in (0, 2)}, (0, 1)
+        "limits",
+        WORKING,
+        {f"5s with {n} workers": f"{n} --time-limit 5s" for n in (0, 2)},
+        (0, 1),
     ),
     *signals(),
 ]

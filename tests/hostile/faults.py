@@ -34,7 +34,9 @@ FAULTS = {  # and a part of the output
 }
 ENV = {"PYTHONPATH": f"lib:{ROOT}"}
 # The registry gets another matcher.
-FINDING = "from mkpc_kaggle.matchers.registry import MATCHERS\nMATCHERS['faulty'] = 'faulty'\n"
+FINDING = (
+    "from mkpc_kaggle.matchers.registry import MATCHERS\nMATCHERS['faulty'] = 'faulty'\n"
+)
 IN_WORKER = SUBMIT.replace("--workers 0", "--workers 1")
 UNITS = f"units = [{UNIT.format(1).replace('sift', 'faulty')}, {UNIT.format(1)}]"
 

@@ -34,7 +34,10 @@ READ = {  # by its path: the command that reads it, and its allowed statuses
     f"weights/deep/{NAME}": (AUTO, (0,)),
     "weights/deep/weights_manifest.txt": (f"weights verify {SEARCH}", (0,)),
     "truth.csv": ("score sub.csv --train-dir T --truth truth.csv", REFUSED),
-    "T/scaling_factors.csv": ("validate --train-dir T --recipe quick.toml --workers 0", REFUSED),
+    "T/scaling_factors.csv": (
+        "validate --train-dir T --recipe quick.toml --workers 0",
+        REFUSED,
+    ),
     "out/s.work/journal.sqlite": (SUBMIT, (0, 2)),  # a link to nothing is followed
     "out/s.work/journal.lock": (SUBMIT, (0, 2)),
 }
@@ -58,7 +61,9 @@ CASES = [
         for what, make in INSTEAD.items()
     ),
     *makes("journals", SUBMIT, {"its first half, resumed": resumed(halve)}),
-    *makes("journals", f"{SUBMIT} --fresh", {"its first half, forgotten": resumed(halve)}, (0,)),
+    *makes(
+        "journals", f"{SUBMIT} --fresh", {"its first half, forgotten": resumed(halve)}, (0,)
+    ),
     *makes("journals", "journal out/s.work", {"its first half, read": resumed(halve)}),
     *makes("files", SUBMIT, {name: replaced(X, make) for name, make in IMAGES.items()}, (0,)),
 ]

@@ -61,9 +61,13 @@ CHANGES = {  # between two runs
     "no database": lambda room: (room / "out/o/database.db").unlink(),
     "no journal": lambda room: room.joinpath(*JOURNAL).unlink(),
     "a journal of noise": lambda room: room.joinpath(*JOURNAL).write_bytes(os.urandom(9999)),
-    "a database of noise": lambda room: (room / "out/o/database.db").write_bytes(os.urandom(9999)),
+    "a database of noise": lambda room: (room / "out/o/database.db").write_bytes(
+        os.urandom(9999)
+    ),
     "a file of the user's": lambda room: (room / "out/o/notes.txt").touch(),
-    "another recipe": lambda room: (room / "quick.toml").write_text(RECIPE.replace("200", "190")),
+    "another recipe": lambda room: (room / "quick.toml").write_text(
+        RECIPE.replace("200", "190")
+    ),
 }
 
 
@@ -79,7 +83,8 @@ def names(table: dict[str, bytes]) -> dict[str, Make]:
         write_images(room / "J")
         (room / "J.png").write_bytes(encoded(".png", picture(40)))
         made = "J" if is_folder else "J.png"
-        os.rename(room / made, os.path.join(os.fsencode(room / "I"), name + made[1:].encode()))  # noqa: PTH104, PTH118
+        path = os.path.join(os.fsencode(room / "I"), name + made[1:].encode())  # noqa: PTH118
+        os.rename(room / made, path)  # noqa: PTH104
 
     return {
         f"{what} name: {told}": lambda room, n=name, f=is_folder: add(room, n, f)
@@ -101,7 +106,12 @@ CASES = [
     ),
     *(
         Case(
-            "folders", f"{n} after 4 s", RECONSTRUCT, nothing, (1, *STATUSES[n]), act=sends(n, 4.0)
+            "folders",
+            f"{n} after 4 s",
+            RECONSTRUCT,
+            nothing,
+            (1, *STATUSES[n]),
+            act=sends(n, 4.0),
         )
         for n in ENDS
     ),

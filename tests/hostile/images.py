@@ -24,7 +24,12 @@ DAMAGES = {
 
 
 def chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return (
+        struct.pack(">I", len(data))
+        + kind
+        + data
+        + struct.pack(">I", zlib.crc32(kind + data))
+    )
 
 
 def png(width: int, height: int, *chunks: bytes, depth: int = 8) -> bytes:
@@ -42,7 +47,9 @@ def rows(width: int, height: int, depth: int = 8) -> bytes:
 # A decoder that believes the head of a file allocates the size that it claims.
 ODD = {
     "2^31 - 1 pixels a side": lambda: png(2**31 - 1, 2**31 - 1),
-    "20,000 black pixels a side": lambda: png(20_000, 20_000, rows(20_000, 20_000, 1), depth=1),
+    "20,000 black pixels a side": lambda: png(
+        20_000, 20_000, rows(20_000, 20_000, 1), depth=1
+    ),
     "1 x 60,000 pixels": lambda: encoded(".jpg", cv2.resize(picture(0), (1, 60_000))),
     "a tag of no end": lambda: (
         encoded(".jpg")[:2] + b"\xff\xe1\xff\xffExif\0\0II*\0\x08\0\0\0" + b"\xff" * 50_000

@@ -29,5 +29,11 @@ CASES = [
         f"{TO} out/s.csv",
         env={"PYTHONIOENCODING": "ascii"},
     ),
-    Case("outputs", "the C locale", f"{TO} out/\u00e9.csv", env={"LC_ALL": "C"}, submission=False),
+    Case(
+        "outputs",
+        "the C locale",
+        f"{TO} out/\u00e9.csv",
+        env={"LC_ALL": "C"},
+        submission=False,
+    ),
 ]

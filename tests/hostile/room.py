@@ -131,7 +131,9 @@ def makes(
     """Return a case for each change of the room, by its name; ``more`` are further fields of the
     cases.
     """
-    return [Case(group, name, command, make, statuses, **more) for name, make in table.items()]
+    return [
+        Case(group, name, command, make, statuses, **more) for name, make in table.items()
+    ]
 
 
 def options(

@@ -23,7 +23,8 @@ ALL = [case for source in SOURCES for case in source.CASES]
 QUICK = ("images", "signals", "faults", "weights", "folders", "unread")
 FIRST = {case.group: case for case in reversed(ALL) if case.group in QUICK}.values()
 MARKED = [
-    pytest.param(case, id=case.id, marks=() if case in FIRST else pytest.mark.slow) for case in ALL
+    pytest.param(case, id=case.id, marks=() if case in FIRST else pytest.mark.slow)
+    for case in ALL
 ]
 
 

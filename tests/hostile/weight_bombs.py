@@ -72,7 +72,12 @@ def cases() -> Iterator[Case]:
         "cut off": written(f"weights/deep/{NAME}", b"cut off"),
     }.items():
         yield Case(
-            "weights", f"{NAME} is {name}, verified", f"weights verify {SEARCH}", make, (1,), NAME
+            "weights",
+            f"{NAME} is {name}, verified",
+            f"weights verify {SEARCH}",
+            make,
+            (1,),
+            NAME,
         )
 
 

@@ -18,7 +18,9 @@ def both(variant, positions):
     state = standin_state(theirs, STAND_INS["aliked"])
     theirs.load_state_dict(state | {"dkd.hw_grid": theirs.dkd.hw_grid})
     ours = Aliked(300, positions)
-    ours.load_state_dict({own_name(name): state[name] for name in state if name != "dkd.hw_grid"})
+    ours.load_state_dict(
+        {own_name(name): state[name] for name in state if name != "dkd.hw_grid"}
+    )
     return prepared(ours, Placement()), theirs
 
 

@@ -20,7 +20,9 @@ from mkpc_kaggle.matchers.networks.warp_refiner import identity_map
 @pytest.mark.parametrize("floats", [1, 64, 1 << 20])
 def test_a_density_is_the_same_in_blocks_of_any_size(monkeypatch, floats):
     monkeypatch.setattr(dense_sampling, "BLOCK_FLOATS", {"cpu": floats})
-    points = torch.rand(50, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    points = torch.rand(
+        50, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     squares = (points[:, None] - points).square().sum(2)
     expected = (squares / (-2 * dense_sampling.BANDWIDTH**2)).clamp(min=-80).exp().sum(1)
     torch.testing.assert_close(dense_sampling.density(points), expected)

@@ -43,8 +43,12 @@ SIFT = partial(glue, sift_lightglue.SHAPE)
 EVERY = {"depth_confidence": -1.0, "width_confidence": -1.0}  # all layers on all keypoints
 KEYPOINTS = partial(Aliked, 2048)
 FILES = (
-    PublicFile("a.pth", "aliked_lightglue", "aliked-n16", "aliked", KEYPOINTS, published_aliked),
-    PublicFile("b.pth", "aliked_lightglue", "aliked-lightglue", "lightglue", ALIKED, old_names),
+    PublicFile(
+        "a.pth", "aliked_lightglue", "aliked-n16", "aliked", KEYPOINTS, published_aliked
+    ),
+    PublicFile(
+        "b.pth", "aliked_lightglue", "aliked-lightglue", "lightglue", ALIKED, old_names
+    ),
     PublicFile("c.pth", "sift_lightglue", "sift-lightglue", "lightglue", SIFT, old_names),
 )
 
@@ -56,7 +60,9 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
 
 @pytest.mark.parametrize("name", ["aliked_lightglue", "sift_lightglue"])
 def test_a_picture_matches_itself_point_by_point(name, store):
-    options = replace(spec_of(name, "test").options(), features=300, **EVERY, filter_threshold=0.0)
+    options = replace(
+        spec_of(name, "test").options(), features=300, **EVERY, filter_threshold=0.0
+    )
     matcher = load_matcher(name, store, options, Placement())
     channels = 1 if matcher.spec.colour is Colour.GRAY else 3
     encodings = matcher.encode([picture(97, 131, channels=channels, multiple=32)])
@@ -73,7 +79,9 @@ def test_layers_compute_in_the_precision_that_is_asked_for(precision, store):
     options = AlikedLightGlueOptions(features=300)
     matcher = load_matcher("aliked_lightglue", store, options, Placement(precision=precision))
     state = matcher._glue.state_dict()
-    is_exact = re.compile(r"posenc|log_assignment|token_confidence|\.ffn\.1\.")  # and layer norms
+    is_exact = re.compile(
+        r"posenc|log_assignment|token_confidence|\.ffn\.1\."
+    )  # and layer norms
     half = getattr(torch, precision)
     expected = {name: torch.float32 if is_exact.search(name) else half for name in state}
     assert {name: tensor.dtype for name, tensor in state.items()} == expected

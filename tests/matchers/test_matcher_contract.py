@@ -90,7 +90,9 @@ def overflow(monkeypatch):
 
 
 def test_overflow_is_an_error_and_never_a_lack_of_keypoints_or_matches(matcher, monkeypatch):
-    encodings = [matcher.encode([picture(matcher, 64, 96, name)]) for name in ("scene", "another")]
+    encodings = [
+        matcher.encode([picture(matcher, 64, 96, name)]) for name in ("scene", "another")
+    ]
     overflow(monkeypatch)
     if matcher.spec.name != "sift_lightglue":  # SIFT is no network
         shown = picture(matcher, 64, 96)

@@ -34,7 +34,9 @@ WITHIN = {"sift": 0.4, "aliked": 1.0, "xfeat_lighterglue": 1.5}
 
 def affine(degrees, scale, x, y):
     """Rotation and scaling about the middle, then a shift; (3, 3) in pixel coordinates."""
-    matrix = cv2.getRotationMatrix2D(((SIZE.width - 1) / 2, (SIZE.height - 1) / 2), degrees, scale)
+    matrix = cv2.getRotationMatrix2D(
+        ((SIZE.width - 1) / 2, (SIZE.height - 1) / 2), degrees, scale
+    )
     matrix[:, 2] += (x, y)
     return np.vstack([matrix, [0, 0, 1]])
 
@@ -50,7 +52,9 @@ MAPS = {
 @cache
 def photograph():
     # Twice reduced, it is sharp at this size.
-    return cv2.resize(load_sample_image("china.jpg")[:, :569], SIZE, interpolation=cv2.INTER_AREA)
+    return cv2.resize(
+        load_sample_image("china.jpg")[:, :569], SIZE, interpolation=cv2.INTER_AREA
+    )
 
 
 @cache
@@ -100,7 +104,9 @@ def test_sift_has_no_offset_at_any_scale():
     for scale in (0.5, 2.0):
         size = Size(*(int(side * scale) for side in SIZE))
         method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-        matches = match_photograph("sift", cv2.resize(photograph(), size, interpolation=method))
+        matches = match_photograph(
+            "sift", cv2.resize(photograph(), size, interpolation=method)
+        )
         H = np.array(
             [
                 [scale, 0, (scale - 1) / 2],

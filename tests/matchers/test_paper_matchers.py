@@ -54,7 +54,9 @@ FEW = {"loma": "\nthreshold = 0.0", "dkm": "\nmatches = 300", "roma": "\nmatches
 def test_odd_small_and_blank_pictures_are_matched_without_an_error(
     clean_environment, monkeypatch, matcher, test_dir, tmp_path
 ):
-    checkpoints = write_checkpoints(tmp_path, [file for file in FILES if file.matcher == matcher])
+    checkpoints = write_checkpoints(
+        tmp_path, [file for file in FILES if file.matcher == matcher]
+    )
     use_manifest(monkeypatch, checkpoints)
     # The published width needs more time and memory than a test should.
     monkeypatch.setattr(roma, "RoMa", narrow_roma)
@@ -72,8 +74,19 @@ def test_odd_small_and_blank_pictures_are_matched_without_an_error(
         max_iterations = 2000
     """)
     output = tmp_path / "out.csv"
-    given = ["--test-dir", test_dir, "--output", output, "--recipe", recipe, "--weights", tmp_path]
-    assert run_command("submit", "--no-report", *given, "--device", "cpu", "--workers", 0) == 0
+    given = [
+        "--test-dir",
+        test_dir,
+        "--output",
+        output,
+        "--recipe",
+        recipe,
+        "--weights",
+        tmp_path,
+    ]
+    assert (
+        run_command("submit", "--no-report", *given, "--device", "cpu", "--workers", 0) == 0
+    )
     assert problem_of(output, test_dir) == ""
     # Every row is an F of rank 2, the fallback of the blank picture too.
     for F in read_submission(output).values():
@@ -81,7 +94,9 @@ def test_odd_small_and_blank_pictures_are_matched_without_an_error(
         assert strengths[2] < 1e-6 * strengths[0] < 1e6 * strengths[1]
     tables = results(tmp_path / "out.work")
     number = {pair: index for index, pair in enumerate(tables.pairs["pair"])}
-    found = {(number[unit.pair], int(unit.unit[0])): unit for unit in tables.units.itertuples()}
+    found = {
+        (number[unit.pair], int(unit.unit[0])): unit for unit in tables.units.itertuples()
+    }
     assert found.keys() == {(pair, stage) for pair in range(3) for stage in (1, 2)}
     assert {unit.failure for unit in found.values()} == {""}
     assert found[0, 1].matches >= 8

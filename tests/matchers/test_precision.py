@@ -54,7 +54,9 @@ def test_auto_takes_half_precision_where_the_processor_has_it(monkeypatch):
         ({"amx_bf16": True, "avx512_bf16": False}, Precision.BFLOAT16),
         ({"avx2": True}, Precision.FLOAT32),
     ):
-        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda flags=flags: flags, raising=False)
+        monkeypatch.setattr(
+            torch.cpu, "get_capabilities", lambda flags=flags: flags, raising=False
+        )
         assert resolve_placement("cpu", "auto") == Placement("cpu", expected)
     monkeypatch.delattr(torch.cpu, "get_capabilities")
     assert fastest_precision("cpu") is Precision.FLOAT32

@@ -27,7 +27,11 @@ Tables = dict[str, Shapes]  # by slot
 LISTS = {
     "loma-b128": ({"variant": "b128"}, "loma/B128", 739),
     "loma-b": ({"variant": "b"}, "loma/B", 1136),  # R has B's architecture
-    "superglue-indoor": ({"training": "indoor"}, "superglue", 339),  # indoor files have these names
+    "superglue-indoor": (
+        {"training": "indoor"},
+        "superglue",
+        339,
+    ),  # indoor files have these names
     "roma-outdoor": ({}, "roma/roma", 603),
     "dkm-outdoor": ({}, "dkm", 813),
     "loftr-outdoor": ({}, "loftr", 211),
@@ -36,7 +40,9 @@ LISTS = {
 }
 # Of the same matchers
 OTHERS = {"superglue": {"superpoint": "superpoint"}, "roma": {"dinov2-vitl14": "roma/dinov2"}}
-TABLE = {"matcher.pos_encoding.pe": (1, 256, 256, 256)}  # computed; a repackaged file may have it
+TABLE = {
+    "matcher.pos_encoding.pe": (1, 256, 256, 256)
+}  # computed; a repackaged file may have it
 
 
 class Published:

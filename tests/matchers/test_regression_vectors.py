@@ -20,7 +20,9 @@ DATA = Path(__file__).parent / "matches.npz"
 NAMES = [name for name in MATCHERS if name != "sift_lightglue"]
 # Of the matches: a threshold or a tie within rounding may fall the other way on another processor
 SAME = 0.95
-TOLERANCES = np.array([0.5, *4 * [0.05], 2e-3])  # pair, pixels, score; a row is within all of them
+TOLERANCES = np.array(
+    [0.5, *4 * [0.05], 2e-3]
+)  # pair, pixels, score; a row is within all of them
 
 
 def found(name):
@@ -33,7 +35,9 @@ def found(name):
     rows = []
     for pair, matches in enumerate(matcher.match(*encodings)):
         number = np.full(len(matches), pair)
-        rows.append(np.column_stack([number, matches.points0, matches.points1, matches.scores]))
+        rows.append(
+            np.column_stack([number, matches.points0, matches.points1, matches.scores])
+        )
     return np.concatenate(rows)
 
 

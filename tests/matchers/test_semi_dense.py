@@ -16,7 +16,9 @@ from mkpc_kaggle.matchers.networks.coarse_matching import coarse_matches
 @pytest.mark.parametrize("held", [0, 2**20])
 def test_matches_are_the_mutual_maxima_of_both_softmaxes(monkeypatch, held):
     # Seven of thirty rows at once: the last block is smaller.
-    monkeypatch.setattr("mkpc_kaggle.matchers.networks.coarse_matching.ROWS_AT_ONCE", {"cpu": 7})
+    monkeypatch.setattr(
+        "mkpc_kaggle.matchers.networks.coarse_matching.ROWS_AT_ONCE", {"cpu": 7}
+    )
     monkeypatch.setattr("mkpc_kaggle.matchers.networks.coarse_matching.HELD_FLOATS", held)
     generator = torch.Generator().manual_seed(0)
     grid0 = torch.randn(5, 6, 16, generator=generator)

@@ -13,11 +13,13 @@ from pictures import as_picture, match_one, write_two_views
 from standin import scene
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "research.md"
-(EXAMPLE,) = re.findall(r"^```python\n(import numpy.*?)^```", PAGE.read_text("utf-8"), re.M | re.S)
-PICTURE = scene(160, 200, 3)
-POINTS = np.stack(np.meshgrid(np.arange(8.0, 120, 8), np.arange(8.0, 88, 8)), axis=-1).reshape(
-    -1, 2
+(EXAMPLE,) = re.findall(
+    r"^```python\n(import numpy.*?)^```", PAGE.read_text("utf-8"), re.M | re.S
 )
+PICTURE = scene(160, 200, 3)
+POINTS = np.stack(
+    np.meshgrid(np.arange(8.0, 120, 8), np.arange(8.0, 88, 8)), axis=-1
+).reshape(-1, 2)
 
 
 class Standin:

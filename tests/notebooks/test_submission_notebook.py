@@ -56,7 +56,9 @@ class Kaggle:
     def run(self, **more: str) -> str:
         """Execute the notebook; return the printed text. AssertionError if a cell fails."""
         variables = environment(KAGGLE_ROOT=str(self.root), **more)
-        return printed(execute(self.notebook, self.executed, self.image, self.working, variables))
+        return printed(
+            execute(self.notebook, self.executed, self.image, self.working, variables)
+        )
 
     def figures(self) -> int:
         return pictures(nbformat.read(self.executed, as_version=4))
@@ -84,7 +86,9 @@ IMAGES = [  # of Kaggle's: Python, OpenCV, torch, NumPy
 
 
 @pytest.mark.parametrize(("python", "opencv", "torch", "numpy"), IMAGES)
-def test_every_kaggle_image_has_the_packages_that_the_dataset_lacks(python, opencv, torch, numpy):
+def test_every_kaggle_image_has_the_packages_that_the_dataset_lacks(
+    python, opencv, torch, numpy
+):
     text = (NOTEBOOKS[0].parents[1] / "pyproject.toml").read_text(encoding="utf-8")
     dependencies = tomllib.loads(text)["project"]["dependencies"]
     taken = {need.name: need for need in map(Requirement, dependencies)}
@@ -154,7 +158,9 @@ def test_a_saved_version_without_a_network_writes_a_submission_and_shows_pairs(
     assert "good: 1 row" in printed
     assert "recipe auto" in printed
     assert "of 525 minutes used" in printed
-    assert printed.count("sweep: ") <= 2, "a notebook keeps every line, so progress is few of them"
+    assert printed.count("sweep: ") <= 2, (
+        "a notebook keeps every line, so progress is few of them"
+    )
     assert f"report: {kaggle.working / 'submission.html'}" in printed
     assert (kaggle.working / "submission.html").is_file()
     assert (kaggle.root / "temp" / "submission.work" / "journal.sqlite").is_file()
@@ -174,7 +180,9 @@ def test_a_failed_run_fails_the_notebook_but_not_the_hidden_rerun(kaggle, demo, 
     kaggle.add_dataset(tmp_path / "package")
     # The public cells once more, after a hidden run: a run of its own would only take longer.
     notebook = nbformat.read(kaggle.notebook, as_version=4)
-    public = [cell.source for cell in notebook.cells if cell.source.startswith("if not IS_RERUN")]
+    public = [
+        cell.source for cell in notebook.cells if cell.source.startswith("if not IS_RERUN")
+    ]
     assert len(public) == 2
     sources = ["print('public'); IS_RERUN = False", *public]
     notebook.cells += map(nbformat.v4.new_code_cell, sources)

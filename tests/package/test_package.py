@@ -45,7 +45,9 @@ FILES = (
 
 
 @pytest.fixture(scope="module", autouse=True)
-def own_manifest(tmp_path_factory: pytest.TempPathFactory, built_once: None) -> Iterator[None]:
+def own_manifest(
+    tmp_path_factory: pytest.TempPathFactory, built_once: None
+) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("MKPC_WEIGHTS", raising=False)
         patch.setattr(store, "KAGGLE_INPUT", tmp_path_factory.mktemp("kaggle"))
@@ -93,7 +95,13 @@ def test_the_dataset_holds_wheels_weights_and_their_licences(made):
     out, package = made
     dataset = out / "dataset"
     names = {path.name for path in dataset.iterdir()}
-    assert {"LICENSE", "README.md", "MIT.txt", "weights_manifest.txt", "requirements.txt"} <= names
+    assert {
+        "LICENSE",
+        "README.md",
+        "MIT.txt",
+        "weights_manifest.txt",
+        "requirements.txt",
+    } <= names
     wheels = {name.partition("-")[0] for name in names if name.endswith(".whl")}
     assert wheels == {"mkpc_kaggle", "kornia", "pycolmap", "kornia_rs", "safetensors"}
     assert torch.equal(load_tensors(dataset / "free.pt.safetensors")["a"], torch.ones(3))
@@ -154,7 +162,9 @@ def test_the_same_request_gives_the_same_bytes(wanted, out):
     assert contents(wanted["out"]) == contents(out)
 
 
-def test_a_private_package_has_all_weights_and_a_public_one_is_not_written_over_it(wanted, capsys):
+def test_a_private_package_has_all_weights_and_a_public_one_is_not_written_over_it(
+    wanted, capsys
+):
     arguments = ["package", "--owner", "someone", "--out", wanted["out"]]
     arguments += ["--python", python_version()]
     arguments += ["--wheels", wanted["wheels"], "--weights", wanted["weights"][0]]
@@ -186,7 +196,9 @@ def test_bad_requests_are_refused_before_anything_is_written(wanted, tmp_path):
         "--python '2.7': expected versions such as": {"pythons": ["2.7"]},
         "unread.pt cannot be read as a checkpoint": {"weights": [unread]},
     }
-    (unread / "weights_manifest.txt").write_text('["unread.pt"]\nslot = "x"\nlicence = "MIT"\n')
+    (unread / "weights_manifest.txt").write_text(
+        '["unread.pt"]\nslot = "x"\nlicence = "MIT"\n'
+    )
     for told, other in bad.items():
         with pytest.raises(UserError, match=told):
             make_package(**wanted | other)

@@ -9,7 +9,16 @@ import numpy as np
 import PIL.Image
 import pytest
 import torch
-from golden import GOLDEN, Stage, Within, compared, golden_arrays, in_order, ready, seeded_tensor
+from golden import (
+    GOLDEN,
+    Stage,
+    Within,
+    compared,
+    golden_arrays,
+    in_order,
+    ready,
+    seeded_tensor,
+)
 
 from mkpc_kaggle.matchers.networks.dense_sampling import (
     sample_matches,
@@ -59,7 +68,9 @@ def computed(name, images, fine_images=(None, None), *, symmetric=True):
     The golden networks run the directions one after the other. Here they are one batch.
     """
     network = network_of(name)
-    features = [network.encode(*versions) for versions in zip(images, fine_images, strict=True)]
+    features = [
+        network.encode(*versions) for versions in zip(images, fine_images, strict=True)
+    ]
     correct = network.decoder.correct
     found = {stride: [] for stride in network.decoder.conv_refiner}
 

@@ -12,7 +12,13 @@ from sparse_stages import assignment_values
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks.dad import select_keypoints
-from mkpc_kaggle.matchers.networks.loma import UNUSED, Loma, Variant, detector_size, parameter_name
+from mkpc_kaggle.matchers.networks.loma import (
+    UNUSED,
+    Loma,
+    Variant,
+    detector_size,
+    parameter_name,
+)
 from mkpc_kaggle.matchers.networks.loma_matcher import (
     LAYERS,
     LomaKeypoints,
@@ -38,7 +44,9 @@ TOLERANCES = {
 @cache
 def whole(variant):
     network = Loma(variant)
-    tensors = {parameter_name(n): t for n, t in standin_state("loma", variant.upper()).items()}
+    tensors = {
+        parameter_name(n): t for n, t in standin_state("loma", variant.upper()).items()
+    }
     load_into(network, tensors, what="golden", unused=UNUSED)
     return prepared(network, Placement())
 
@@ -122,7 +130,9 @@ def matcher_stages(case):
     for pair in range(len(golden["keypoints0"]) if batched else 1):
         arrays = dict(golden)
         if batched:
-            arrays = {name: value[pair] for name, value in golden.items() if name != "thresholds"}
+            arrays = {
+                name: value[pair] for name, value in golden.items() if name != "thresholds"
+            }
         image0 = LomaKeypoints(arrays["keypoints0"], arrays["descriptors0"])
         image1 = LomaKeypoints(arrays["keypoints1"], arrays["descriptors1"])
         values = matcher_values(matcher(variant), image0, image1, first)
@@ -142,11 +152,15 @@ def pipeline_stages(case, variant):
     found = []
     for index in (0, 1):
         pixels = images[f"image{index}"]
-        size = detector_size(Size(pixels.shape[1], pixels.shape[0]), int(golden["detector_size"]))
+        size = detector_size(
+            Size(pixels.shape[1], pixels.shape[0]), int(golden["detector_size"])
+        )
         assert (1, 3, size.height, size.width) == tuple(
             golden[f"detector_input_shape{index}"].tolist()
         )
-        seen = [image_of(resized_by_pil(pixels, shape)) for shape in (size[::-1], (side, side))]
+        seen = [
+            image_of(resized_by_pil(pixels, shape)) for shape in (size[::-1], (side, side))
+        ]
         keypoints = network.encode(*seen, number)
         found.append(keypoints)
         values = {"keypoints": keypoints.points, "descriptors": keypoints.descriptors}

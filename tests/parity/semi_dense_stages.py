@@ -61,7 +61,9 @@ def computed_of_pair(network, images, masks, scales, coarse_scales):
     with recorded(network, "loftr_coarse") as calls:
         matches = network.match(*maps, masks)
     transformed = zip(calls[0][1], maps, strict=True)
-    grids = [tokens.reshape(len(tokens), *own.coarse.shape[2:], 256) for tokens, own in transformed]
+    grids = [
+        tokens.reshape(len(tokens), *own.coarse.shape[2:], 256) for tokens, own in transformed
+    ]
     coarse = matches.coarse
     confidence = confidence_of(network, *grids, masks)
     values = {
@@ -125,7 +127,10 @@ class Evaluated(AspanTransformer):
 
     def side(self, coarse, mask):
         height, width = coarse.shape[2:]
-        self.train_size = (self.scale * COARSE_STRIDE * height, self.scale * COARSE_STRIDE * width)
+        self.train_size = (
+            self.scale * COARSE_STRIDE * height,
+            self.scale * COARSE_STRIDE * width,
+        )
         rows, columns = height // self.coarsest[0], width // self.coarsest[1]
         return replace(super().side(coarse, mask), factor=(rows, columns))
 
@@ -142,7 +147,9 @@ def aspanformer_state():
     shapes = json.loads((GOLDEN / "aspanformer" / "shapes.json").read_text())["parameters"]
     state = {}
     for name, shape in shapes.items():
-        value = seeded_tensor(name, shape, 4.0 if name.startswith("fine_preprocess.") else 1.0)
+        value = seeded_tensor(
+            name, shape, 4.0 if name.startswith("fine_preprocess.") else 1.0
+        )
         if name.endswith(".affine"):
             value += 1.0
         elif name.endswith("attention.temp"):
@@ -165,7 +172,9 @@ def aspanformer_stages(case, make):
     golden = golden_arrays("aspanformer", case)
     originals = [golden[f"image{side}"] for side in (0, 1)]
     images = []
-    for image in originals:  # as in the evaluation: sides rounded down, bilinear, not antialiased
+    for (
+        image
+    ) in originals:  # as in the evaluation: sides rounded down, bilinear, not antialiased
         size = [side // SPEC.multiple * SPEC.multiple for side in image.shape[2:]]
         images.append(torch.nn.functional.interpolate(image, size=size, mode="bilinear"))
     masks, scales = masks_and_scales(golden)

@@ -95,7 +95,11 @@ REFUSED_IMAGES = {
     "floats to 255": (pixels().astype(float), ValueError, "0..1"),
     "NaN": (np.full((9, 9), np.nan), ValueError, "0..1"),
     "four channels": (np.zeros((9, 9, 4), np.uint8), ValueError, "(9, 9, 4)"),
-    "batch of tensors": (torch.zeros(2, 3, 9, 9, dtype=torch.uint8), ValueError, "(2, 3, 9, 9)"),
+    "batch of tensors": (
+        torch.zeros(2, 3, 9, 9, dtype=torch.uint8),
+        ValueError,
+        "(2, 3, 9, 9)",
+    ),
     "PIL, floats": (PIL.Image.new("F", (9, 9)), ValueError, "more than 16 bits"),
     "no such file": ("none.png", UserError, "none.png: no such file"),
     "a folder": (".", UserError, "not a regular file"),
@@ -114,7 +118,9 @@ class Unrun:
 
 
 def unrun(*units):
-    return TwoStageMatcher(Recipe(units or (Unit(1, "unrun", 320),)), matchers={"unrun": Unrun()})
+    return TwoStageMatcher(
+        Recipe(units or (Unit(1, "unrun", 320),)), matchers={"unrun": Unrun()}
+    )
 
 
 @pytest.mark.parametrize("form", REFUSED_IMAGES)
@@ -142,7 +148,9 @@ def test_camera_matrices_in_each_form_are_the_same(given):
     assert first.dtype == second.dtype == np.float64
 
 
-@pytest.mark.parametrize("given", [K, (K, None), 300.0, (K * 0, K), (K, K.T), (K, K * np.nan)])
+@pytest.mark.parametrize(
+    "given", [K, (K, None), 300.0, (K * 0, K), (K, K.T), (K, K * np.nan)]
+)
 def test_other_camera_matrices_are_refused_before_any_matching(given):
     with pytest.raises((TypeError, ValueError)):
         unrun()(pixels(), pixels(), intrinsics=given)
@@ -159,8 +167,16 @@ def test_other_camera_matrices_are_refused_before_any_matching(given):
         ({"recipe": Path("none.toml")}, UserError, ["none.toml cannot be read"]),
         ({"weights": 5}, TypeError, ["int", "iterable"]),
         ({"weights": "none"}, UserError, ["weights none: no such directory"]),
-        ({"weights": {"aliked": "a.pth"}}, UserError, ["unknown slot 'aliked'", "aliked-n16"]),
-        ({"weights": {"aliked-n16": "none.pth"}}, UserError, ["aliked-n16", "none.pth", "No such"]),
+        (
+            {"weights": {"aliked": "a.pth"}},
+            UserError,
+            ["unknown slot 'aliked'", "aliked-n16"],
+        ),
+        (
+            {"weights": {"aliked-n16": "none.pth"}},
+            UserError,
+            ["aliked-n16", "none.pth", "No such"],
+        ),
         ({"device": "gpu"}, UserError, ["'gpu'"]),
         ({"precision": "half"}, ValueError, ["'half'", "Precision"]),
         ({"settings": [1]}, TypeError, ["sequence"]),
@@ -217,7 +233,9 @@ def test_the_name_of_a_matcher_is_a_recipe(tmp_path):
 
 def test_a_model_of_another_name_is_refused():
     raises(lambda: unrun()(pixels(), pixels(), model="G"), ValueError, "'G' is not a valid")
-    raises(lambda: unrun()(pixels(), pixels(), model="E"), ValueError, "model E needs intrinsics")
+    raises(
+        lambda: unrun()(pixels(), pixels(), model="E"), ValueError, "model E needs intrinsics"
+    )
 
 
 def test_arguments_of_pairs_are_those_of_a_call():
@@ -281,7 +299,13 @@ ONE = Matches([(1, 1)], [(2, 2)], [1])
 )
 def test_another_answer_of_the_users_own_matcher_is_named(answer, word):
     call = own(lambda *_: answer)
-    raises(lambda: call(pixels(), pixels()), TypeError, "match of 'own'", "a list of Matches", word)
+    raises(
+        lambda: call(pixels(), pixels()),
+        TypeError,
+        "match of 'own'",
+        "a list of Matches",
+        word,
+    )
 
 
 class Unlucky(SiftMatcher):
@@ -299,7 +323,9 @@ def unlucky(monkeypatch):
 
 def test_a_unit_that_fails_is_a_warning_and_an_estimate_without_points_names_it(unlucky):
     with (
-        pytest.warns(RuntimeWarning, match=r"unit 1:sift@320 failed: RuntimeError: out of luck"),
+        pytest.warns(
+            RuntimeWarning, match=r"unit 1:sift@320 failed: RuntimeError: out of luck"
+        ),
         pytest.warns(RuntimeWarning, match="no F was found: too few"),
     ):
         match = TwoStageMatcher(SIFT)(pixels(), pixels(40))

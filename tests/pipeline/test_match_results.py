@@ -24,6 +24,8 @@ def test_a_match_plots_itself_on_its_images(tmp_path):
     match = TwoStageMatcher(Recipe((Unit(1, "sift", 320), Unit(2, "sift", 320))))(*files)
     for given in (files, images):
         figure = match.plot(*given)
-        assert f"{match.estimate.inlier_count} inliers" in figure.axes[0].get_title(loc="left")
+        assert f"{match.estimate.inlier_count} inliers" in figure.axes[0].get_title(
+            loc="left"
+        )
         assert len(figure.axes[0].images) == 2
     figure.savefig(tmp_path / "x.png")

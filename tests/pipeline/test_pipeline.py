@@ -287,7 +287,9 @@ def test_no_matches_are_a_result():
     assert [region.reason for region in match.regions] == ["too few points"] * 2
 
 
-@pytest.mark.parametrize("error", [RuntimeError("out of luck"), cv2.error("no"), ValueError()])
+@pytest.mark.parametrize(
+    "error", [RuntimeError("out of luck"), cv2.error("no"), ValueError()]
+)
 def test_a_matcher_that_raises_fails_its_units_and_the_others_run(error):
     units = [Unit(1, "bad", 480), Unit(1, "sift", 480), Unit(2, "bad", 480)]
     matchers = {"bad": Scripted(error), "sift": SiftMatcher(SiftOptions(), "cpu")}

@@ -26,7 +26,9 @@ def test_photographs_of_all_subfolders_are_read_and_hidden_ones_are_not(tmp_path
 
 
 def test_files_that_are_not_read_are_counted_in_one_line(tmp_path, capsys):
-    root = written(tmp_path, "1.jpg", "2.jpg", "3.jpg", "4.heic", "5.HEIC", "README", "x/a.txt")
+    root = written(
+        tmp_path, "1.jpg", "2.jpg", "3.jpg", "4.heic", "5.HEIC", "README", "x/a.txt"
+    )
     assert len(read_folder(root)) == 3
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith("4 files not read: 2 .heic, 1 .txt, 1 no suffix")
@@ -49,7 +51,10 @@ def test_names_in_a_list_of_pairs_may_have_blanks(tmp_path):
     text = "# a comment\n\na b.png c.png\n  d e f.png\ta b.png \r\nc.png a b.png\n"
     (tmp_path / "pairs.txt").write_text(text)
     found = read_pair_list(tmp_path / "pairs.txt", root, read_folder(root))
-    assert [(a.name, b.name) for a, b in found] == [("a b.png", "c.png"), ("a b.png", "d e f.png")]
+    assert [(a.name, b.name) for a, b in found] == [
+        ("a b.png", "c.png"),
+        ("a b.png", "d e f.png"),
+    ]
 
 
 @pytest.mark.parametrize("line", ["a.png", "a.png a.png", "a.png d.png", ""])
@@ -94,7 +99,10 @@ def test_the_first_row_that_names_an_image_has_its_camera(photographs):
 @pytest.mark.parametrize(
     ("row", "told"),
     [
-        ("a.png,PINHOLE,128,96,100 100 64 48", "the row is for 128 x 96, and a.png has 64 x 48"),
+        (
+            "a.png,PINHOLE,128,96,100 100 64 48",
+            "the row is for 128 x 96, and a.png has 64 x 48",
+        ),
         ("a.png,SIMPLE_PINHOLE,64,48,4.2 32 24", "no focal length of a.png"),
         ("a.png,SIMPLE_PINHOLE,64,48,50 32", "SIMPLE_PINHOLE has 3 parameters"),
         ("a.png,SIMPLE_PINHOLE,64,48,nan 32 24", "is not finite"),

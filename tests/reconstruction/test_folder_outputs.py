@@ -109,7 +109,11 @@ def test_pinholes_are_links_that_move_with_the_folders(tmp_path):
 
 def test_a_distorted_lens_gets_undistorted_copies(tmp_path):
     write_scene(model_of(NAMES, tmp_path / "images", k=-0.1), tmp_path / "out")
-    list(write_results(tmp_path / "images", tmp_path / "out", tmp_path / "out" / "work" / "scene"))
+    list(
+        write_results(
+            tmp_path / "images", tmp_path / "out", tmp_path / "out" / "work" / "scene"
+        )
+    )
     model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
     for image in model.images.values():
         picture = read_image(tmp_path / "out" / "images" / image.name)
@@ -173,5 +177,9 @@ def test_a_scene_without_models_has_its_database_and_an_empty_table(tmp_path):
     shutil.rmtree(out / "work" / "scene" / "models" / "0")
     assert list(write_results(tmp_path / "images", out, out / "work" / "scene")) == [[], []]
     remove_results(out, outputs.FOLDERS)
-    assert sorted(path.name for path in out.iterdir()) == ["cameras.csv", "database.db", "work"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        "cameras.csv",
+        "database.db",
+        "work",
+    ]
     assert len((out / "cameras.csv").read_text().splitlines()) == 1

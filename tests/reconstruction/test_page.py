@@ -9,7 +9,9 @@ import pandas as pd
 import pycolmap
 from test_reconstruct import FIRST, run, write_flat
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "folder.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "folder.md").read_text(
+    encoding="utf-8"
+)
 BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE, re.M | re.S)
 *COLMAP, OURS = BLOCKS
 

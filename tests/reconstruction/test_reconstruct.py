@@ -54,7 +54,10 @@ class MixedMatcher(SyntheticMatcher):
         second = number_of(seen1)
         self.calls.append((first, second))
         # Both in one scene: its matches. Otherwise a few wrong ones, as real matchers find.
-        for scene, start, count in ((self.scenes[0], 0, FIRST), (self.scenes[1], FIRST, SECOND)):
+        for scene, start, count in (
+            (self.scenes[0], 0, FIRST),
+            (self.scenes[1], FIRST, SECOND),
+        ):
             if start <= first < second < start + count:
                 names = [f"{first - start:04}", f"{second - start:04}"]
                 (found,) = (
@@ -84,7 +87,9 @@ def run(
     root: Path, out: Path, matcher: SyntheticMatcher | None = None, **options: object
 ) -> tuple[SfmModel, ...]:
     given = {"synthetic": matcher or MixedMatcher()}
-    return reconstruct(root, out, RECIPE, device="cpu", matchers=given, progress=False, **options)
+    return reconstruct(
+        root, out, RECIPE, device="cpu", matchers=given, progress=False, **options
+    )
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +123,9 @@ def test_mixed_scenes_are_a_model_each_and_foreign_images_are_in_none(mixed):
     assert list(map(names_of, models)) == expected
     for number, names in enumerate(expected):
         model = pycolmap.Reconstruction(out / "models" / str(number))
-        assert sorted(image.name for image in model.images.values() if image.has_pose) == names
+        assert (
+            sorted(image.name for image in model.images.values() if image.has_pose) == names
+        )
         assert model.num_points3D() == len(models[number].points) > 100
     assert not (out / "models" / "2").exists()
     assert (out / "report.html").exists()
@@ -147,7 +154,9 @@ def test_the_table_has_the_cameras_of_the_models_and_they_are_right(mixed):
 def test_the_table_of_a_run_is_a_table_of_known_cameras(mixed, tmp_path):
     out, _ = mixed
     shutil.copy(out / "cameras.csv", tmp_path / "known.csv")
-    (model, *_) = run(out.parent / "images", tmp_path / "out", intrinsics=tmp_path / "known.csv")
+    (model, *_) = run(
+        out.parent / "images", tmp_path / "out", intrinsics=tmp_path / "known.csv"
+    )
     table = pd.read_csv(out / "cameras.csv", index_col="image")
     for found in model.images:
         expected = table.loc[found.image.name, "parameters"].split()
@@ -188,12 +197,21 @@ def test_colmap_goes_on_with_photographs_that_exif_turns(tmp_path):
         set_exif(path, orientation)
     # Undistorted pictures of a lens would be smaller.
     (found,) = run(root, out, settings={"scene.camera_model": "SIMPLE_PINHOLE"})
-    sizes = {f"{n:02}.png": SIZE if o in (1, 3) else SIZE[::-1] for n, o in enumerate(ORIENTATIONS)}
+    sizes = {
+        f"{n:02}.png": SIZE if o in (1, 3) else SIZE[::-1] for n, o in enumerate(ORIENTATIONS)
+    }
     assert {image.image.name: image.image.size for image in found.images} == sizes
     # COLMAP's own mapper, from our database and the user's photographs
-    settings = {"min_model_size": 3, "random_seed": 0, "extract_colors": True, "num_threads": 1}
+    settings = {
+        "min_model_size": 3,
+        "random_seed": 0,
+        "extract_colors": True,
+        "num_threads": 1,
+    }
     options = pycolmap.IncrementalPipelineOptions(settings)
-    (model,) = pycolmap.incremental_mapping(out / "database.db", root, tmp_path, options).values()
+    (model,) = pycolmap.incremental_mapping(
+        out / "database.db", root, tmp_path, options
+    ).values()
     assert model.num_reg_images() == FIRST
     pycolmap.undistort_images(tmp_path / "flat", out / "models" / "0", root)
     for name, size in sizes.items():
@@ -204,12 +222,15 @@ def test_colmap_goes_on_with_photographs_that_exif_turns(tmp_path):
     flattened = pycolmap.Reconstruction(tmp_path / "flat" / "sparse")
     # Sizes by EXIF's orientation would be exchanged.
     undistorted = {
-        image.name: (image.camera.width, image.camera.height) for image in flattened.images.values()
+        image.name: (image.camera.width, image.camera.height)
+        for image in flattened.images.values()
     }
     assert undistorted == sizes
     truth = MixedMatcher().scenes[0].cameras
     for number, record in enumerate(found.images):
-        stored = turned_camera(truth[f"{number:04}"], -TURNS.get(ORIENTATIONS[number], 0), SIZE)
+        stored = turned_camera(
+            truth[f"{number:04}"], -TURNS.get(ORIENTATIONS[number], 0), SIZE
+        )
         expected = stored.R @ truth["0000"].R.T
         np.testing.assert_allclose(
             record.camera.R @ found.images[0].camera.R.T, expected, atol=0.01
@@ -304,7 +325,9 @@ def test_without_a_folder_for_results_the_models_are_returned_and_nothing_is_pri
     assert [path.name for path in tmp_path.iterdir()] == ["images"]
 
 
-def refused(capsys: pytest.CaptureFixture[str], *words: object, recipe: str = "classical") -> str:
+def refused(
+    capsys: pytest.CaptureFixture[str], *words: object, recipe: str = "classical"
+) -> str:
     assert run_command("reconstruct", *words, "--recipe", recipe) == 2
     return capsys.readouterr().err.splitlines()[-1]
 
@@ -313,7 +336,9 @@ def test_bad_input_is_refused_in_one_line(tmp_path, capsys):
     root = write_flat(tmp_path / "images", 3)
     out = tmp_path / "out"
     files = sorted(root.iterdir())
-    assert f"{files[0]} is no folder; give the folder" in refused(capsys, *files, "--out", out)
+    assert f"{files[0]} is no folder; give the folder" in refused(
+        capsys, *files, "--out", out
+    )
     assert "contains, or lies in, the input" in refused(capsys, root, "--out", root / "out")
     table = tmp_path / "known.csv"
     table.write_text("image,model\n")

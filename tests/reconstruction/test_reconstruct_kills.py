@@ -40,7 +40,9 @@ def write_inputs(demo: DemoSet, home: Path) -> None:
         cv2.imwrite(str(home / "masks" / f"{file.name}.png"), mask)
     rows = ["image,camera_model,width,height,parameters"]
     with (scene / "calibration.csv").open() as stream:
-        intrinsics = {row["image_id"]: row["camera_intrinsics"] for row in csv.DictReader(stream)}
+        intrinsics = {
+            row["image_id"]: row["camera_intrinsics"] for row in csv.DictReader(stream)
+        }
     for file in images[:4]:
         K = np.array(intrinsics[file.stem].split(), float).reshape(3, 3)
         height, width = cv2.imread(str(file)).shape[:2]
@@ -54,7 +56,11 @@ def write_inputs(demo: DemoSet, home: Path) -> None:
 def test_a_run_that_is_ended_at_random_moments_ends_with_the_same_files(demo, tmp_path):
     write_inputs(demo, tmp_path)
     write_recipe(
-        tmp_path / "small.toml", (1, 480), (1, 640), (2, 640), more="[scene]\ncandidates = 4\n"
+        tmp_path / "small.toml",
+        (1, 480),
+        (1, 640),
+        (2, 640),
+        more="[scene]\ncandidates = 4\n",
     )
 
     def begin(out: str, *more: str) -> "subprocess.Popen[bytes]":
@@ -73,7 +79,9 @@ def test_a_run_that_is_ended_at_random_moments_ends_with_the_same_files(demo, tm
         return contents(tmp_path / out / "work" / "scenes")
 
     def names_in(out: str) -> set[str]:
-        return {name for name in contents(tmp_path / out) if not name.startswith("work/scenes/")}
+        return {
+            name for name in contents(tmp_path / out) if not name.startswith("work/scenes/")
+        }
 
     # Before any run: there is no OUT yet.
     inputs = contents(tmp_path)
@@ -107,4 +115,6 @@ def test_a_run_that_is_ended_at_random_moments_ends_with_the_same_files(demo, tm
         assert expected.items() <= files_of(out).items()
         assert names_in(out) == names_in("undisturbed")
     assert ended >= ROUNDS
-    assert {name: text for name, text in contents(tmp_path).items() if name in inputs} == inputs
+    assert {
+        name: text for name, text in contents(tmp_path).items() if name in inputs
+    } == inputs

@@ -38,7 +38,9 @@ def cameras(count=4):
     for number in range(count):
         t = -np.array([float(number), 0, 0])
         K = np.array([[80.0, 0, 40], [0, 80, 30], [0, 0, 1]])
-        rows.append(("batch", 0, f"{number}.png", 80, 60, 9, 80.0, K, np.eye(3), t, "PINHOLE"))
+        rows.append(
+            ("batch", 0, f"{number}.png", 80, 60, 9, 80.0, K, np.eye(3), t, "PINHOLE")
+        )
     names = ["batch", "model", "image", "width", "height", "points", "focal", "K", "R", "t"]
     return pd.DataFrame(rows, columns=[*names, "camera_model"])
 
@@ -102,6 +104,8 @@ def test_the_view_in_a_page_opens_without_a_network(made, tmp_path):
     path.write_text(page(replace(results(work), cameras=cameras(), points=points)))
     options = ["--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=5000"]
     command = [CHROMIUM, *options, "--dump-dom", path.as_uri()]
-    shown = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
+    shown = subprocess.run(
+        command, capture_output=True, text=True, check=True, timeout=120
+    ).stdout
     # Plotly has made its parts.
     assert "gl-container" in shown

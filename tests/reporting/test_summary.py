@@ -27,7 +27,9 @@ UNREACHED = Described(failure=None)
 
 def scene(*names: str, **fields: object) -> SceneRecord:
     pose = Camera(np.eye(3), np.eye(3), np.zeros(3))
-    images = [RegisteredImage(BatchImage(name, name, Size(80, 60)), pose, 50) for name in names]
+    images = [
+        RegisteredImage(BatchImage(name, name, Size(80, 60)), pose, 50) for name in names
+    ]
     models = (SfmModel(tuple(images), np.zeros((0, 3)), 0.5),) if names else ()
     record = SceneRecord.of("batch", [Reconstruction(names, models)], key="scene of batch")
     return replace(record, **fields)
@@ -72,7 +74,9 @@ def test_images_of_a_folder_without_a_camera_are_named():
     files = {"batch": ["a", "copy of a", "b", "c", "d", "e"]}
     digests = {"a": "a", "copy of a": "a", "b": "b"}
     pairs = [Described(images=("a", "copy of a")), Described(images=("a", "b"))]
-    found = report(Ending.COMPLETE, *pairs, scenes=(scene("a"),), files=files, digests=digests)
+    found = report(
+        Ending.COMPLETE, *pairs, scenes=(scene("a"),), files=files, digests=digests
+    )
     text = summary(found)
     # Identical files share a camera.
     assert "2 of 6 images with a camera" in text

@@ -27,7 +27,8 @@ def model() -> Any:
     for number in sorted(model.points3D)[::2]:
         # Copied, since a deletion changes the track
         track = [
-            (each.image_id, each.point2D_idx) for each in model.points3D[number].track.elements
+            (each.image_id, each.point2D_idx)
+            for each in model.points3D[number].track.elements
         ]
         for image, keypoint in sorted(track)[1:-1]:
             observations.delete_observation(image, keypoint)

@@ -101,7 +101,9 @@ ALONG_Y = np.array([[0, 0, 1], [0, 0, 0], [-1, 0, 0]]) / np.sqrt(2)
 
 def moved(along_y: int, along_x: int, pixels: float = 40.0) -> Matches:
     """Return matches that agree with ALONG_Y, and others that agree with ALONG_X."""
-    points = np.random.default_rng(0).uniform(50, 400, (along_y + along_x, 2)).astype(np.float32)
+    points = (
+        np.random.default_rng(0).uniform(50, 400, (along_y + along_x, 2)).astype(np.float32)
+    )
     shift = np.zeros_like(points)
     shift[:along_y, 1] = pixels
     shift[along_y:, 0] = pixels

@@ -52,7 +52,10 @@ def focal_ratios(model: SfmModel) -> dict[str, float]:
 def test_photographs_of_one_content_are_one_image():
     pair = SCENE.pairs[0]
     copied = replace(pair.image0, name="a copy.jpg")
-    pairs = [replace(pair, image0=copied), replace(pair, image0=pair.image1, image1=pair.image0)]
+    pairs = [
+        replace(pair, image0=copied),
+        replace(pair, image0=pair.image1, image1=pair.image0),
+    ]
     graph = ViewGraph.of_pairs(pairs)
     assert graph.names == ("a copy.jpg", pair.image1.name)
     assert len(graph.edges) == 1

@@ -76,7 +76,9 @@ def test_cameras_are_right_in_spite_of_noise_and_wrong_matches(scene):
 
 
 @pytest.mark.parametrize(("all_tracks", "most"), [(6, None), (5, 20)])
-def test_a_large_scene_starts_from_a_few_tracks_of_each_image(scene, monkeypatch, all_tracks, most):
+def test_a_large_scene_starts_from_a_few_tracks_of_each_image(
+    scene, monkeypatch, all_tracks, most
+):
     """The cameras are as right, and points of all tracks come in the end."""
     monkeypatch.setattr(colmap, "TRACKS_PER_IMAGE", 20)
     starts = []

@@ -34,7 +34,9 @@ OWN = SceneConfig(cameras=CameraSharing.IMAGE)
 
 
 def images(count: int, size: Size = WIDE, prefix: str = "") -> list[BatchImage]:
-    return [BatchImage(f"{prefix}{number}", f"{prefix}{number}", size) for number in range(count)]
+    return [
+        BatchImage(f"{prefix}{number}", f"{prefix}{number}", size) for number in range(count)
+    ]
 
 
 def model(
@@ -100,7 +102,9 @@ EXIF = {
 
 
 @pytest.mark.parametrize(("exif", "last", "expected", "undecided"), EXIF.values(), ids=EXIF)
-def test_exif_decides_whether_an_image_that_seems_zoomed_may_share(exif, last, expected, undecided):
+def test_exif_decides_whether_an_image_that_seems_zoomed_may_share(
+    exif, last, expected, undecided
+):
     every = [replace(image, focal=exif) for image in images(4)]
     every.append(replace(images(5)[4], focal=last))
     models = [model(every, [840, 839, 840, 841, 1200])]

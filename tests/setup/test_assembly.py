@@ -36,7 +36,9 @@ def test_another_recipe_without_its_weights_is_refused_with_the_command_that_get
         assemble("light")
     # A recipe of the user has no name that the command knows.
     mine = Recipe((Unit(1, "sift", 640), Unit(1, "superglue", 640)), name="mine")
-    with pytest.raises(UserError, match="`mkpc weights fetch superpoint superglue-outdoor --out"):
+    with pytest.raises(
+        UserError, match="`mkpc weights fetch superpoint superglue-outdoor --out"
+    ):
         assemble(mine)
 
 

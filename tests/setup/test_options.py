@@ -44,7 +44,9 @@ def settings_of(recipe: Recipe) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("matcher", "option", "value"), OPTIONS)
-def test_an_option_changes_the_settings_of_its_unit(clean_environment, matcher, option, value):
+def test_an_option_changes_the_settings_of_its_unit(
+    clean_environment, matcher, option, value
+):
     recipe = Recipe((Unit(1, matcher, 640),))
     changed = with_settings(recipe, {f"matchers.{matcher}.{option}": value})
     former = settings_of(recipe)

@@ -56,8 +56,12 @@ def dinov2_alone(state: dict[str, Tensor]) -> dict[str, Any]:
 def published_loma(state: dict[str, Tensor]) -> dict[str, Any]:
     """The matcher's names bare, with the assignments of the other layers that training had."""
     names = {name: name.removeprefix("matcher.") for name in state}
-    names |= {name: f"_{name}" for name in state if name.startswith(("detector.", "descriptor."))}
-    earlier = {f"log_assignment.{index}.matchability.bias": torch.ones(1) for index in range(9)}
+    names |= {
+        name: f"_{name}" for name in state if name.startswith(("detector.", "descriptor."))
+    }
+    earlier = {
+        f"log_assignment.{index}.matchability.bias": torch.ones(1) for index in range(9)
+    }
     return {names[name]: tensor for name, tensor in state.items()} | earlier
 
 
@@ -77,7 +81,9 @@ class PublicFile:
 
 FILES = (
     PublicFile("superpoint_v1.pth", "superglue", "superpoint", "superpoint", SuperPoint),
-    PublicFile("superglue_outdoor.pth", "superglue", "superglue-outdoor", "superglue", SuperGlue),
+    PublicFile(
+        "superglue_outdoor.pth", "superglue", "superglue-outdoor", "superglue", SuperGlue
+    ),
     PublicFile("outdoor_ds.ckpt", "loftr", "loftr-outdoor", "loftr", Loftr, wrapped),
     PublicFile(
         "quadtree_outdoor.ckpt", "quadtree", "quadtree-outdoor", "quadtree", Quadtree, wrapped
@@ -94,10 +100,20 @@ FILES = (
     # Narrow ones, which load where ``adapters.roma.RoMa`` is ``narrow_roma``, too.
     PublicFile("roma_outdoor.pth", "roma", "roma-outdoor", "roma", narrow_roma, roma_alone),
     PublicFile(
-        "dinov2_vitl14_pretrain.pth", "roma", "dinov2-vitl14", "roma", narrow_roma, dinov2_alone
+        "dinov2_vitl14_pretrain.pth",
+        "roma",
+        "dinov2-vitl14",
+        "roma",
+        narrow_roma,
+        dinov2_alone,
     ),
     PublicFile(
-        "loma_B128.pth", "loma", "loma-b128", "loma", lambda: Loma(Variant.B128), published_loma
+        "loma_B128.pth",
+        "loma",
+        "loma-b128",
+        "loma",
+        lambda: Loma(Variant.B128),
+        published_loma,
     ),
 )
 

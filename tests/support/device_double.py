@@ -70,7 +70,9 @@ class Tagged(torch.Tensor):
 
     @classmethod
     def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
-        assert DeviceDouble.current is not None, f"{func}: a tagged tensor outside of the double"
+        assert DeviceDouble.current is not None, (
+            f"{func}: a tagged tensor outside of the double"
+        )
         return DeviceDouble.current.run(func, args, kwargs or {})
 
 
@@ -92,9 +94,13 @@ class DeviceDouble(TorchDispatchMode):
             stack.enter_context(patch.object(target, name, value))
         overwriting = torch.__future__.get_overwrite_module_params_on_conversion()
         torch.__future__.set_overwrite_module_params_on_conversion(True)
-        stack.callback(torch.__future__.set_overwrite_module_params_on_conversion, overwriting)
+        stack.callback(
+            torch.__future__.set_overwrite_module_params_on_conversion, overwriting
+        )
         stack.callback(torch._C._set_only_lift_cpu_tensors, torch._C._only_lift_cpu_tensors())
-        torch._C._set_only_lift_cpu_tensors(True)  # torch.tensor(..., device="cuda") comes by here
+        torch._C._set_only_lift_cpu_tensors(
+            True
+        )  # torch.tensor(..., device="cuda") comes by here
         self._undo.append((stack, DeviceDouble.current))
         DeviceDouble.current = self
         return super().__enter__()
@@ -136,7 +142,11 @@ class DeviceDouble(TorchDispatchMode):
             "__enter__",
             lambda mode: grads.append(torch.set_grad_enabled(False)),
         )
-        yield torch.inference_mode, "__exit__", lambda mode, *error: grads.pop().__exit__(*error)
+        yield (
+            torch.inference_mode,
+            "__exit__",
+            lambda mode, *error: grads.pop().__exit__(*error),
+        )
         yield torch.amp.autocast_mode, "is_autocast_available", lambda kind: True
         yield torch.cuda.amp.common, "amp_definitely_not_available", lambda: False
 
@@ -153,7 +163,9 @@ class DeviceDouble(TorchDispatchMode):
         ]
         tagged = [each for each in tensors if isinstance(each, Tagged)]
         wanted = (
-            None if kwargs.get("device") is None else self.known(torch.device(kwargs["device"]))
+            None
+            if kwargs.get("device") is None
+            else self.known(torch.device(kwargs["device"]))
         )
         if not tagged and (wanted is None or wanted.type == "cpu"):
             return func(*args, **kwargs)
@@ -208,7 +220,9 @@ class DeviceDouble(TorchDispatchMode):
         free = [each for each in tensors if not isinstance(each, Tagged) and each.dim() == 0]
         if name in INDEXING and isinstance(args[0], Tagged):
             free += [
-                index for index in args[1] if index is not None and not isinstance(index, Tagged)
+                index
+                for index in args[1]
+                if index is not None and not isinstance(index, Tagged)
             ]
         met = {each.device for each in tensors if not any(each is other for other in free)}
         if len(met) > 1:
@@ -221,4 +235,6 @@ class DeviceDouble(TorchDispatchMode):
     def _check_generator(self, name, generator, where):
         made_for = self._generators.get(generator._cdata) if generator is not None else where
         if made_for != where:
-            raise MixedDevicesError(f"{name}: a generator of {made_for} for a tensor on {where}")
+            raise MixedDevicesError(
+                f"{name}: a generator of {made_for} for a tensor on {where}"
+            )

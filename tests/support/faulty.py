@@ -87,7 +87,11 @@ class FaultyMatcher(RectifiedMatcher):
     once: Path | None = None
 
     def _match(self, seen0: Seen, seen1: Seen) -> Matches:
-        if seen0.brightness == self.at and max(seen0.view.content) > self.above and self._is_due():
+        if (
+            seen0.brightness == self.at
+            and max(seen0.view.content) > self.above
+            and self._is_due()
+        ):
             self.fault()
         return super()._match(seen0, seen1)
 
@@ -159,7 +163,10 @@ def runner(run: Callable[[SceneJob], Solution]) -> Callable[[SceneJob], Solution
 
 
 def scenes_by(
-    monkeypatch: pytest.MonkeyPatch, make: Callable[[SceneJob], Solution], *, process: bool = False
+    monkeypatch: pytest.MonkeyPatch,
+    make: Callable[[SceneJob], Solution],
+    *,
+    process: bool = False,
 ) -> None:
     """Let ``make`` reconstruct batches, in a thread of this process or, as real runs do, in a
     process.
@@ -211,7 +218,9 @@ def thread_place(
     pipeline: Callable[[], Pipeline] | None = None,
 ) -> Place:
     """Where workers are threads of this process, with that matcher, or that pipeline."""
-    make = partial(Pipeline, THREE_UNITS, {matcher.name: matcher}.__getitem__, minibatch=minibatch)
+    make = partial(
+        Pipeline, THREE_UNITS, {matcher.name: matcher}.__getitem__, minibatch=minibatch
+    )
     # The threads of the tests' process stay as they are.
     runner = partial(MatchRunner, pipeline or make, limit=None)
     worker = partial(ThreadWorker, name, runner, lambda: None)
@@ -225,9 +234,14 @@ def use_places(
     pause.
     """
 
-    def site_of(assembly: Assembly, _: int, clock: Callable[[], float], log: Path) -> LocalSite:
+    def site_of(
+        assembly: Assembly, _: int, clock: Callable[[], float], log: Path
+    ) -> LocalSite:
         site = LocalSite(assembly, 0, clock, log)
-        site.places = [*(place for place in site.places if place.kind is not Kind.MATCH), *used]
+        site.places = [
+            *(place for place in site.places if place.kind is not Kind.MATCH),
+            *used,
+        ]
         site.fallback = list(fallback)
         return site
 

@@ -20,7 +20,11 @@ def why_not_there() -> str:
     # Sizes alone: digests of 120 MB in each process of the tests would take seconds.
     sizes = {path.name: path.stat().st_size for path in GENUINE.glob("*") if path.is_file()}
     missing = [file.name for file in genuine_files() if sizes.get(file.name) != file.size]
-    return f"{', '.join(missing)} not in {GENUINE}: `make weights` fetches them" if missing else ""
+    return (
+        f"{', '.join(missing)} not in {GENUINE}: `make weights` fetches them"
+        if missing
+        else ""
+    )
 
 
 def genuine_store() -> WeightStore:

@@ -18,7 +18,9 @@ from mkpc_kaggle.matchers.networks.placement import prepared
 
 GOLDEN = SHARED / "golden"
 
-needs_golden = pytest.mark.skipif(not GOLDEN.is_dir(), reason=f"no golden vectors in {GOLDEN}")
+needs_golden = pytest.mark.skipif(
+    not GOLDEN.is_dir(), reason=f"no golden vectors in {GOLDEN}"
+)
 
 
 def golden_arrays(network, case):
@@ -58,7 +60,9 @@ def seeded_tensor(name, shape, gain=1.0):
 def recorded(network, name):
     """A list that fills with the inputs and the output of each call of that module."""
     calls = []
-    hook = network.get_submodule(name).register_forward_hook(lambda _, *call: calls.append(call))
+    hook = network.get_submodule(name).register_forward_hook(
+        lambda _, *call: calls.append(call)
+    )
     yield calls
     hook.remove()
 
@@ -102,7 +106,8 @@ class Stage(NamedTuple):
         got = self.got
         expected = self.expected
         alike = (
-            got.shape == expected.shape and got.is_floating_point() == expected.is_floating_point()
+            got.shape == expected.shape
+            and got.is_floating_point() == expected.is_floating_point()
         )
         if not alike or not got.isfinite().all():
             return float("inf")

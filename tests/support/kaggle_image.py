@@ -36,7 +36,10 @@ def make_image(directory: Path) -> Path:
     venv.create(directory, symlinks=True)
     site = next(directory.glob("lib/python*/site-packages"))
     for installed in closure(PACKAGES).values():
-        for entry in {file.parts[0] for file in installed.files or ()} - {"..", "__pycache__"}:
+        for entry in {file.parts[0] for file in installed.files or ()} - {
+            "..",
+            "__pycache__",
+        }:
             link = site / entry
             if not link.is_symlink():
                 link.symlink_to(Path(str(installed.locate_file(entry))))

@@ -50,7 +50,9 @@ SHIFT = 8  # pixels between the two pictures of a pair
 
 # Filling a network takes long, and no test changes this one: each matcher gets a copy.
 @cache
-def standin(name: str, make: Callable[..., nn.Module], *settings: Any, **named: Any) -> nn.Module:
+def standin(
+    name: str, make: Callable[..., nn.Module], *settings: Any, **named: Any
+) -> nn.Module:
     return filled(make(*settings, **named), name)
 
 
@@ -65,11 +67,15 @@ def unprepared(*network: Any, **named: Any) -> Any:
 
 def superglue_matcher(placement: Placement, keypoints: int = 200) -> SuperGlueMatcher:
     superpoint = ours(placement, "superpoint", SuperPoint, max_keypoints=keypoints)
-    return SuperGlueMatcher(superpoint, ours(placement, "superglue", SuperGlue), placement.device)
+    return SuperGlueMatcher(
+        superpoint, ours(placement, "superglue", SuperGlue), placement.device
+    )
 
 
 def semi_dense_matcher(name, make, placement):
-    return SemiDenseMatcher(ours(placement, name, make), spec_of(name, "test"), placement.device)
+    return SemiDenseMatcher(
+        ours(placement, name, make), spec_of(name, "test"), placement.device
+    )
 
 
 def dkm_matcher(placement: Placement, matches: int = 300) -> DenseMatcher:
@@ -109,7 +115,9 @@ def xfeat_keypoints(placement: Placement, keypoints: int) -> Keypoints:
     # Weights that were never trained detect nothing above the published threshold.
     network.detection_threshold = 0.0
     network.net = filled(network.net, "xfeat")
-    return xfeat_lighterglue.xfeat_encoder(network, keypoints, placement), xfeat_lighterglue.SHAPE
+    return xfeat_lighterglue.xfeat_encoder(
+        network, keypoints, placement
+    ), xfeat_lighterglue.SHAPE
 
 
 KEYPOINTS = {
@@ -120,11 +128,17 @@ KEYPOINTS = {
 
 
 def lightglue_matcher(
-    name: str, placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
+    name: str,
+    placement: Placement,
+    keypoints: int = 200,
+    layers: int = 2,
+    threshold: float = 0.0,
 ) -> LightGlueMatcher:
     encode, shape = KEYPOINTS[name](placement, keypoints)
     # All layers and keypoints: what untrained weights would drop is chance.
-    network = unprepared("lightglue", LightGlue, replace(shape, layers=layers), -1, -1, threshold)
+    network = unprepared(
+        "lightglue", LightGlue, replace(shape, layers=layers), -1, -1, threshold
+    )
     return LightGlueMatcher(spec_of(name, "test"), encode, network, placement)
 
 

@@ -31,7 +31,8 @@ finally:
 """
 OFFLINE = ("unshare", "--map-root-user", "--net")
 HAS_NAMESPACES = (
-    shutil.which("unshare") and subprocess.run([*OFFLINE, "true"], check=False).returncode == 0
+    shutil.which("unshare")
+    and subprocess.run([*OFFLINE, "true"], check=False).returncode == 0
 )
 needs_namespaces = pytest.mark.skipif(
     not HAS_NAMESPACES, reason="unshare --net is not permitted here"
@@ -39,7 +40,11 @@ needs_namespaces = pytest.mark.skipif(
 
 
 def execute(
-    notebook: Path, executed: Path, python: str | Path, working: Path, variables: Mapping[str, str]
+    notebook: Path,
+    executed: Path,
+    python: str | Path,
+    working: Path,
+    variables: Mapping[str, str],
 ) -> nbformat.NotebookNode:
     """Run ``notebook`` in ``working`` under that interpreter; the executed notebook, also in
     ``executed``.
@@ -49,7 +54,9 @@ def execute(
     with TemporaryDirectory(prefix="mkpc-") as runtime:
         env = {**variables, "JUPYTER_RUNTIME_DIR": runtime}
         settings = {"env": env, "cwd": working}
-        done = subprocess.run(command, capture_output=True, text=True, check=False, **settings)
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, **settings
+        )
     assert done.returncode == 0, done.stderr
     return nbformat.read(executed, as_version=4)
 
@@ -81,7 +88,9 @@ def with_pictures_alone(notebook: nbformat.NotebookNode) -> nbformat.NotebookNod
         if cell.cell_type == "code":
             cell.execution_count = None
             cell.outputs = [
-                nbformat.v4.new_output("display_data", {"image/jpeg": output["data"]["image/jpeg"]})
+                nbformat.v4.new_output(
+                    "display_data", {"image/jpeg": output["data"]["image/jpeg"]}
+                )
                 for output in cell.outputs
                 if "image/jpeg" in output.get("data", {})
             ]

@@ -31,7 +31,9 @@ def picture(
     return as_picture(pixels if channels == 3 else pixels[..., 0], multiple, padding)
 
 
-def as_picture(pixels: np.ndarray, multiple: int = 1, padding: tuple[int, int] = (0, 0)) -> Picture:
+def as_picture(
+    pixels: np.ndarray, multiple: int = 1, padding: tuple[int, int] = (0, 0)
+) -> Picture:
     height, width = pixels.shape[:2]
     content = Size(width, height)
     sides = []
@@ -50,10 +52,14 @@ def match_one(matcher: Any, first: Picture, second: Picture) -> Matches:
 
 def same(first: Matches, second: Matches) -> bool:
     parts = ("points0", "points1", "scores")
-    return all(getattr(first, part).tobytes() == getattr(second, part).tobytes() for part in parts)
+    return all(
+        getattr(first, part).tobytes() == getattr(second, part).tobytes() for part in parts
+    )
 
 
-def agreement(first: torch.Tensor, second: torch.Tensor, within: float, p: float = 2.0) -> float:
+def agreement(
+    first: torch.Tensor, second: torch.Tensor, within: float, p: float = 2.0
+) -> float:
     """The share of the rows of either that lie within that distance of a row of the other.
 
     Both directions count: a matcher with a few right matches, or with many more, does not agree.
@@ -69,7 +75,11 @@ def write_two_views(directory: Path) -> None:
     """Write a.jpg and b.jpg: two parts of a photograph, 40 pixels apart; and a folder of three parts."""
     photograph = load_sample_image("china.jpg")[..., ::-1]
     (directory / "photographs").mkdir()
-    parts = [("a.jpg", 0), ("b.jpg", 40), *((f"photographs/{n}.jpg", 20 * n) for n in range(3))]
+    parts = [
+        ("a.jpg", 0),
+        ("b.jpg", 40),
+        *((f"photographs/{n}.jpg", 20 * n) for n in range(3)),
+    ]
     for name, shift in parts:
         # A strip, because RootSIFT enlarges a view to 1,536 pixels.
         part = photograph[120:220, 60 + shift : 420 + shift]

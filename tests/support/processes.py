@@ -11,7 +11,9 @@ def started_with(mark: str) -> dict[int, str]:
     for process in Path("/proc").glob("[0-9]*"):
         try:
             if mark.encode() in (process / "environ").read_bytes():
-                found[int(process.name)] = (process / "cmdline").read_text().replace("\0", " ")
+                found[int(process.name)] = (
+                    (process / "cmdline").read_text().replace("\0", " ")
+                )
         except OSError:  # another user's, or it has ended meanwhile
             continue
     return found

@@ -131,7 +131,9 @@ def run(
         recipe, matchers={each.name: each for each in (matcher, *more)}, device="cpu"
     )
     budget = budget or Budget(time.monotonic(), limit)
-    session = Session(work_dir, budget, interrupt or Interrupt(), progress=False, workers=workers)
+    session = Session(
+        work_dir, budget, interrupt or Interrupt(), progress=False, workers=workers
+    )
     with session.watched() if is_watched else nullcontext():
         if output is not None:
             return submit(pairs, assembly, session, output)

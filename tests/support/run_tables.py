@@ -76,7 +76,10 @@ def tables_of(
             store.put(each.rows(number))
         images = [(name, 0, 0, content, 80, 60, 0.0) for name, content in digests.items()]
         store.put(
-            {"image": images, "result": [(each.key, each.to_json()) for each in scenes if each.key]}
+            {
+                "image": images,
+                "result": [(each.key, each.to_json()) for each in scenes if each.key],
+            }
         )
         about = asdict(About({"name": "x"}, files=dict(files)))
         about["scenes"] = [(each.batch, each.key, each.failure) for each in scenes]

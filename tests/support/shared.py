@@ -14,7 +14,9 @@ DATA = SHARED / "data"
 WEIGHTS = SHARED / "weights"
 
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no pictures in {DATA}")
-needs_weights = pytest.mark.skipif(not WEIGHTS.is_dir(), reason=f"no checkpoints in {WEIGHTS}")
+needs_weights = pytest.mark.skipif(
+    not WEIGHTS.is_dir(), reason=f"no checkpoints in {WEIGHTS}"
+)
 
 
 def contents(directory: Path) -> dict[str, bytes]:
@@ -46,7 +48,8 @@ def scores_of(out: Path, *options: object) -> dict[str, Any]:
 def write_recipe(path: Path, *units: tuple[int, int], more: str = "") -> Path:
     """Write a recipe with a unit of SIFT for each stage and long side."""
     texts = [
-        f'{{ stage = {stage}, matcher = "sift", long_side = {side} }}' for stage, side in units
+        f'{{ stage = {stage}, matcher = "sift", long_side = {side} }}'
+        for stage, side in units
     ]
     path.write_text(f"units = [{', '.join(texts)}]\n{more}")
     return path

@@ -52,7 +52,9 @@ from mkpc_kaggle.setup.console import Progress
 
 RESTART_S = 8.0  # imports and loading of a worker, about as long as with torch
 ESTIMATE_S = 0.1  # of a pair
-WAKE_S = 1.0  # the longest wait; the real loop wakes every 0.2 s, and may give out other work then
+WAKE_S = (
+    1.0  # the longest wait; the real loop wakes every 0.2 s, and may give out other work then
+)
 STALL = 20.0  # how many times as long a unit takes that stalls
 SIZE = Size(640, 480)
 MATCHES = 200  # that a unit finds
@@ -73,7 +75,9 @@ MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {
 }
 
 
-def switch_off(mechanism: str, change: Callable[[object, str, object], None] = setattr) -> None:
+def switch_off(
+    mechanism: str, change: Callable[[object, str, object], None] = setattr
+) -> None:
     """Run without a mechanism of the plan from now on."""
     for owner, name, value in MECHANISMS[mechanism]:
         change(owner, name, value)
@@ -132,14 +136,18 @@ class Scenario:
     @property
     def recipe(self) -> Recipe:
         count = len(self.costs)
-        units = [Unit(1 if number % 2 == 0 else 2, f"m{number}", 100) for number in range(count)]
+        units = [
+            Unit(1 if number % 2 == 0 else 2, f"m{number}", 100) for number in range(count)
+        ]
         config = SceneConfig(pairs_per_image=self.pairs_per_image, candidates=self.candidates)
         scene = config if self.batches else None
         return Recipe(tuple(units), scene=scene)
 
     @property
     def keys(self) -> Keys:
-        return Keys(tuple(unit.name for unit in self.recipe.units), "mkpc", "estimate", "scene")
+        return Keys(
+            tuple(unit.name for unit in self.recipe.units), "mkpc", "estimate", "scene"
+        )
 
     @property
     def fates(self) -> dict[int, Cause]:
@@ -271,7 +279,9 @@ class SimulatedSite(Site):
             (f"place {n}", partial(self.match_worker, is_bad=n >= good), Kind.MATCH)
             for n in range(scenario.workers)
         ]
-        makers.append(("estimates", lambda: SimulatedWorker(self, self.estimate), Kind.ESTIMATE))
+        makers.append(
+            ("estimates", lambda: SimulatedWorker(self, self.estimate), Kind.ESTIMATE)
+        )
         for number in range(scenario.scene_places):
             makers.append((f"scenes {number}", self.scene_worker, Kind.SCENE))
         self.places = [Place(*maker) for maker in makers]
@@ -328,7 +338,12 @@ class SimulatedSite(Site):
         """Return the seconds that a stall of a unit takes on an uncached view, at the costs of this
         time.
         """
-        return STALL * self.costs[unit.name] * max(1.0, self.scenario.miss_factor) * self.drift(now)
+        return (
+            STALL
+            * self.costs[unit.name]
+            * max(1.0, self.scenario.miss_factor)
+            * self.drift(now)
+        )
 
     def match_at(self, is_bad: bool, warm: set[str], job: MatchJob) -> Drawn:
         """Draw the answer of a place of its own, on which a job may be lost for a reason."""
@@ -388,7 +403,9 @@ class SimulatedSite(Site):
                         self.stall_seconds(unit, begun + spent),
                     )
                 spent += took
-                rows.append(UnitResult(unit, POINTS, 0.0, took, warm_up=unit.name not in warm))
+                rows.append(
+                    UnitResult(unit, POINTS, 0.0, took, warm_up=unit.name not in warm)
+                )
                 warm.add(unit.name)
         return spent, tuple(map(PairMatch, map(tuple, found))), stalled
 
@@ -408,9 +425,9 @@ class SimulatedSite(Site):
         rng = self._scene_rng
         begun = self.clock.now
         spread = math.exp(0.3 * rng.normal() - 0.3**2 / 2)
-        spent = (SCENE_START_S + spread * scenario.scene_seconds * len(job.pairs)) * self.drift(
-            begun
-        )
+        spent = (
+            SCENE_START_S + spread * scenario.scene_seconds * len(job.pairs)
+        ) * self.drift(begun)
         # By the key, so that a scene that is made again has the same value
         disagreement = int(job.key[:4], 16) / 65536
         choices = (Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE),) * len(job.pairs)
@@ -539,13 +556,17 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
     time = Budget(0.0, scenario.limit, clock)
     site = SimulatedSite(scenario, clock, time.stop_units)
     share = max(1, scenario.batches) / scenario.pairs
-    pairs = [Pair(str(n), f"{int(n * share):03d}", f"{n:07d}", "b") for n in range(scenario.pairs)]
+    pairs = [
+        Pair(str(n), f"{int(n * share):03d}", f"{n:07d}", "b") for n in range(scenario.pairs)
+    ]
     names = {name for pair in pairs for name in (pair.file0, pair.file1)}
     published: list[int] = []
     interrupt = threading.Event()
     if store is None:
         store = memory_store()
-        weakref.finalize(store, store.db.close)  # since 3.13, Python warns of open connections
+        weakref.finalize(
+            store, store.db.close
+        )  # since 3.13, Python warns of open connections
     publish = lambda state: published.append(len(state.written[1]))  # noqa: E731
     about = About({"scene": {}} if scenario.batches else {})
     request = Request(pairs, scenario.recipe, scenario.keys, about=about, publish=publish)
@@ -593,7 +614,9 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
         {batch for batch, number in state.batches.items() if state.stale[number]},
         [
             [*points, key]
-            for points, key in zip(state.points.tolist(), state.estimate.tolist(), strict=True)
+            for points, key in zip(
+                state.points.tolist(), state.estimate.tolist(), strict=True
+            )
         ],
         tuple(place.name for place in closed),
         tuple(place.name for place in closed if place.name not in site.bad_names),

@@ -34,14 +34,22 @@ class StandIn:
 
 
 # Found by trial: with them a picture and its shifted copy have matches, and not everything matches.
-SUPERGLUE = {"kenc.encoder.12.weight": 0.3, "kenc.encoder.12.bias": 0.1, "final_proj.weight": 5.0}
+SUPERGLUE = {
+    "kenc.encoder.12.weight": 0.3,
+    "kenc.encoder.12.bias": 0.1,
+    "final_proj.weight": 5.0,
+}
 SUPERGLUE |= {
     "*.attn.proj.[01].weight": 16.0,
     "*.mlp.0.weight": 8.0,
     "*.mlp.3.weight": 0.1,
     "*.mlp.3.bias": 0.01,
 }
-LIGHTGLUE = {"input_proj.weight": 16.0, "transformers.*.ffn.3.*": 0.1, "*.final_proj.weight": 4.0}
+LIGHTGLUE = {
+    "input_proj.weight": 16.0,
+    "transformers.*.ffn.3.*": 0.1,
+    "*.final_proj.weight": 4.0,
+}
 ASPANFORMER = {"*.layer3_outconv.weight": 2.0, "*.flow_decoder.2.weight": 0.3}
 ROMA = {
     "*.gamma": 10.0,
@@ -64,7 +72,9 @@ STAND_INS = {
     ),
     "superglue": StandIn(1.0, SUPERGLUE, {"bin_score": 45.0}),
     "loftr": StandIn(2.0, {"backbone.layer3_outconv.weight": 0.9}),
-    "quadtree": StandIn(2.0, {"backbone.layer3_outconv.weight": 1.8, "*.attn.py_att.weight": 4.0}),
+    "quadtree": StandIn(
+        2.0, {"backbone.layer3_outconv.weight": 1.8, "*.attn.py_att.weight": 4.0}
+    ),
     "aspanformer": StandIn(2.0, ASPANFORMER, {"coarse_matching.temperature": 6.0}),
     "aliked": StandIn(2.0, {"score_head.6.weight": 3.0, "desc_head.offset_conv.2.*": 3.0}),
     "xfeat": StandIn(2.0),
@@ -129,7 +139,11 @@ def standin_state(network: nn.Module, standin: StandIn) -> dict[str, Tensor]:
             state[name] = torch.zeros_like(tensor)
             continue
         scale = np.prod(
-            [factor for pattern, factor in standin.scales.items() if fnmatchcase(name, pattern)]
+            [
+                factor
+                for pattern, factor in standin.scales.items()
+                if fnmatchcase(name, pattern)
+            ]
         )
         value = scale * value_of(name, tuple(tensor.shape), standin.gain)
         state[name] = torch.from_numpy(np.asarray(value, np.float32))

@@ -93,7 +93,8 @@ class Room:
         """Begin a run, as a session does. ``other`` are other settings."""
         self.state = state_of(recipe, pairs, contents, **other)
         facts = [
-            (image.name, 0, 0, image.digest, 80, 60, 0.0) for image in self.state.images.values()
+            (image.name, 0, 0, image.digest, 80, 60, 0.0)
+            for image in self.state.images.values()
         ]
         self.store.put({"image": facts})
         self.state.restore(self.store)

@@ -32,9 +32,13 @@ class SyntheticMatcher(RectifiedMatcher):
         self.calls.append((max(seen0.view.content), seen0.brightness))
         names = [f"{number_of(seen):04}" for seen in (seen0, seen1)]
         # The scene has each pair once, in the order of `batch_pairs`.
-        (found,) = (p.matches for p in self.scene.pairs if [p.image0.name, p.image1.name] == names)
+        (found,) = (
+            p.matches for p in self.scene.pairs if [p.image0.name, p.image1.name] == names
+        )
         return Matches(
-            seen0.view.from_image(found.points0), seen1.view.from_image(found.points1), found.scores
+            seen0.view.from_image(found.points0),
+            seen1.view.from_image(found.points1),
+            found.scores,
         )
 
 

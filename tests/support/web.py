@@ -12,7 +12,9 @@ class Site:
     """The behaviour of the server; it may be changed between requests. ``asked`` gets each request's path."""
 
     data: bytes
-    breaks: list[int] = field(default_factory=list)  # bytes after which the first connections break
+    breaks: list[int] = field(
+        default_factory=list
+    )  # bytes after which the first connections break
     statuses: list[int] = field(default_factory=list)  # errors that the first requests get
     redirect: str = ""
     asked: list[str] = field(default_factory=list)
@@ -36,7 +38,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Length", str(len(site.data)))
             self.end_headers()
             with suppress(ConnectionError):
-                self.wfile.write(site.data[: site.breaks.pop(0)] if site.breaks else site.data)
+                self.wfile.write(
+                    site.data[: site.breaks.pop(0)] if site.breaks else site.data
+                )
 
     def log_message(self, *_: object) -> None:
         pass

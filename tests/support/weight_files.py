@@ -13,9 +13,13 @@ def digest_of(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def line(name: str = "a.pt", data: bytes = DATA, *, slot: str = "slot", **more: str) -> WeightFile:
+def line(
+    name: str = "a.pt", data: bytes = DATA, *, slot: str = "slot", **more: str
+) -> WeightFile:
     return WeightFile(
-        slot, **{"licence": "MIT", "size": len(data), "sha256": digest_of(data)} | more, name=name
+        slot,
+        **{"licence": "MIT", "size": len(data), "sha256": digest_of(data)} | more,
+        name=name,
     )
 
 

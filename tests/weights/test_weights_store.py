@@ -30,7 +30,9 @@ def test_a_file_is_found_in_the_directory_and_below_it(tmp_path):
         WeightStore([tmp_path / "gone"])
 
 
-def test_directories_are_searched_in_order_then_the_environment_then_kaggle(tmp_path, monkeypatch):
+def test_directories_are_searched_in_order_then_the_environment_then_kaggle(
+    tmp_path, monkeypatch
+):
     homes = [put(tmp_path / name) for name in ("one", "two", "three", "four", "kaggle")]
     # A directory of the environment may be missing, such as a drive that is not mounted.
     listed = [tmp_path / "gone", *homes[2:4]]
@@ -44,7 +46,9 @@ def test_directories_are_searched_in_order_then_the_environment_then_kaggle(tmp_
 
 def test_the_first_existing_alternative_is_taken_and_missing_ones_are_all_named(tmp_path):
     files = [line("a.pt"), line("b.pt", OTHER), line("c.pt", slot="other")]
-    says = r"no weights for slot: a\.pt or b\.pt not found; `mkpc weights fetch slot --out DIR`"
+    says = (
+        r"no weights for slot: a\.pt or b\.pt not found; `mkpc weights fetch slot --out DIR`"
+    )
     with pytest.raises(UserError, match=says):
         WeightStore([tmp_path], files).load("slot")
     put(tmp_path, "b.pt", OTHER)
@@ -90,7 +94,10 @@ def test_a_manifest_beside_weights_adds_files_and_overrides_none(tmp_path, monke
 
 @pytest.mark.parametrize(
     ("data", "says"),
-    [(OTHER[:21], f"{digest_of(OTHER[:21])}.*{digest_of(DATA)}"), (DATA[:-1], "20 bytes.*cut off")],
+    [
+        (OTHER[:21], f"{digest_of(OTHER[:21])}.*{digest_of(DATA)}"),
+        (DATA[:-1], "20 bytes.*cut off"),
+    ],
 )
 def test_a_file_with_other_bytes_is_passed_over_by_name_and_the_search_continues(
     tmp_path, data, says

@@ -56,6 +56,8 @@ def aliked_encoder(network: Aliked, placement: Placement) -> Encode:
     return keypoint_encoder(prepared(network, in_float32), in_float32)
 
 
-def load(weights: WeightStore, options: AlikedOptions, placement: Placement) -> NeighbourMatcher:
+def load(
+    weights: WeightStore, options: AlikedOptions, placement: Placement
+) -> NeighbourMatcher:
     encode = load_encoder(weights, options.features, options.variant, placement)
     return NeighbourMatcher(SPEC, encode, options.ratio)

@@ -22,7 +22,9 @@ SPEC = MatcherSpec(
 )
 
 
-def load(weights: WeightStore, options: LightGlueOptions, placement: Placement) -> LightGlueMatcher:
+def load(
+    weights: WeightStore, options: LightGlueOptions, placement: Placement
+) -> LightGlueMatcher:
     network = DISK()
     load_into(network, weights.load("disk"), what="disk")
 

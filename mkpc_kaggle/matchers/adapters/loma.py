@@ -39,7 +39,9 @@ class LomaOptions:
     descriptor_scale: float = 784 / 1024
 
     def __post_init__(self) -> None:
-        check_ranges(self, max_keypoints=AT_LEAST_1, threshold=SHARE, descriptor_scale=POSITIVE)
+        check_ranges(
+            self, max_keypoints=AT_LEAST_1, threshold=SHARE, descriptor_scale=POSITIVE
+        )
 
 
 SPEC = MatcherSpec("loma", LomaOptions, slots=("loma-{variant}",))
@@ -72,7 +74,9 @@ class LomaAdapter(PairwiseMatcher[LomaEncoding]):
 
     @torch.inference_mode()
     def encode(self, pictures: Sequence[Picture]) -> list[LomaEncoding]:
-        return [LomaEncoding(self._keypoints(picture), picture.content) for picture in pictures]
+        return [
+            LomaEncoding(self._keypoints(picture), picture.content) for picture in pictures
+        ]
 
     def _keypoints(self, picture: Picture) -> LomaKeypoints:
         content = picture.content
@@ -93,7 +97,9 @@ class LomaAdapter(PairwiseMatcher[LomaEncoding]):
         return self._network.encode(to_detect, to_describe, self.options.max_keypoints)
 
     def _match(self, first: LomaEncoding, second: LomaEncoding) -> Matches:
-        found = self._network.matcher(first.keypoints, second.keypoints, self.options.threshold)
+        found = self._network.matcher(
+            first.keypoints, second.keypoints, self.options.threshold
+        )
         return Matches(
             first.points[found.index0.cpu().numpy()],
             second.points[found.index1.cpu().numpy()],

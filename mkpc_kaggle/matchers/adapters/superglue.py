@@ -64,13 +64,19 @@ class SuperGlueMatcher(PairwiseMatcher[SuperPointKeypoints]):
     def encode(self, pictures: Sequence[Picture]) -> list[SuperPointKeypoints]:
         return list(self._superpoint(image_batch(pictures, self.device)))
 
-    def _match(self, keypoints0: SuperPointKeypoints, keypoints1: SuperPointKeypoints) -> Matches:
+    def _match(
+        self, keypoints0: SuperPointKeypoints, keypoints1: SuperPointKeypoints
+    ) -> Matches:
         found = self._superglue(keypoints0, keypoints1)
         return matches_of(keypoints0.points, keypoints1.points, found)
 
 
-def load(weights: WeightStore, options: SuperGlueOptions, placement: Placement) -> SuperGlueMatcher:
-    superpoint = SuperPoint(options.nms_radius, options.keypoint_threshold, options.max_keypoints)
+def load(
+    weights: WeightStore, options: SuperGlueOptions, placement: Placement
+) -> SuperGlueMatcher:
+    superpoint = SuperPoint(
+        options.nms_radius, options.keypoint_threshold, options.max_keypoints
+    )
     superglue = SuperGlue(options.sinkhorn_iterations, options.match_threshold)
     for network, slot in zip((superpoint, superglue), SPEC.slots_for(options), strict=True):
         load_into(network, weights.load(slot), what=slot)

@@ -45,7 +45,9 @@ def adaptive_span(flow: Tensor, factor: int) -> Tensor:
     return cells[..., :2] + pattern * cells[..., 2:]
 
 
-def sample_usable(samples: Tensor, mask: Tensor, key_size: tuple[int, int], factor: int) -> Tensor:
+def sample_usable(
+    samples: Tensor, mask: Tensor, key_size: tuple[int, int], factor: int
+) -> Tensor:
     """Return (N, P, 64) bool: whether the mask of the *query* image is valid at the samples.
 
     The key image's mask would be right, but the networks were published with this oversight.
@@ -95,7 +97,9 @@ def span_attention(
     return torch.cat(messages, dim=1).view_as(q)
 
 
-def _attend_cells(queries: Tensor, read: Tensor, heads: int, excluded: Tensor | None) -> Tensor:
+def _attend_cells(
+    queries: Tensor, read: Tensor, heads: int, excluded: Tensor | None
+) -> Tensor:
     """Return messages (p, 4, C) to scaled queries from samples (p, 64, 2 C).
 
     Samples marked in ``excluded`` (p, 64) send none.

@@ -243,7 +243,9 @@ class DescriptorHead(nn.Module):
         offsets = self.offsets(patches, max(height, width) / 4)  # (K, M, 2)
 
         positions = (points[:, None] + offsets).flatten(0, 1)  # (K M, 2)
-        read = joined.sampled(positions, image.repeat_interleave(offsets.shape[1]))  # (K M, C)
+        read = joined.sampled(
+            positions, image.repeat_interleave(offsets.shape[1])
+        )  # (K M, C)
         read = torch.selu_(pointwise(self.sf_conv, read)).view(len(points), -1)  # (K, M C)
         # The sum over positions of a matrix each is one product with the stacked matrices.
         mixed = linear(read, self.agg_weights.flatten(0, 1).T)
@@ -256,7 +258,9 @@ class DescriptorHead(nn.Module):
         first_bias = self.offset_conv.get_parameter("0.bias")
         last = self.offset_conv.get_parameter("2.weight")  # (2 M, 2 M, 1, 1)
         last_bias = self.offset_conv.get_parameter("2.bias")
-        rows = first.permute(0, 2, 3, 1).flatten(1)  # (2 M, 9 C): pixel by pixel, like patches
+        rows = first.permute(0, 2, 3, 1).flatten(
+            1
+        )  # (2 M, 9 C): pixel by pixel, like patches
         hidden = torch.selu_(linear(patches, rows, first_bias))
         moved = linear(hidden, last.flatten(1), last_bias).clamp_(-reach, reach)
         # The first M channels are x, the others y.

@@ -295,7 +295,9 @@ class AspanTransformer(nn.Module):
         self.train_size = train_size
         self.pos_transform = nn.Conv2d(TOP, FLOW, 1, bias=False)
         self.ini_layer = InitialStage()
-        self.layers = nn.ModuleList(AspanBlock(last=index == BLOCKS - 1) for index in range(BLOCKS))
+        self.layers = nn.ModuleList(
+            AspanBlock(last=index == BLOCKS - 1) for index in range(BLOCKS)
+        )
         # The weights of 3x3 convolutions have the memory layout of the grids.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
@@ -318,7 +320,10 @@ class AspanTransformer(nn.Module):
         height, width = grid.shape[1:3]
         # Each axis has its own factor, as in the published code's online mode.
         train_height, train_width = self.train_size
-        scale = (train_height / (COARSE_STRIDE * height), train_width / (COARSE_STRIDE * width))
+        scale = (
+            train_height / (COARSE_STRIDE * height),
+            train_width / (COARSE_STRIDE * width),
+        )
         positions = sine_positions(height, width, FIXED_DECAY, scale, grid.device)
         positions = positions[None]  # (1, h, w, 256)
         # Contiguous, because attention reads the grid as tokens by ``view``.

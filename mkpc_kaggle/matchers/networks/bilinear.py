@@ -94,8 +94,12 @@ class DeformableConv2d(nn.Conv2d):
         positions = offsets + (pixels[:, :, None] + taps)  # (B, h, w, 9, 2)
 
         # The convolution is a linear map of the nine samples of each pixel.
-        image = torch.arange(batch, device=x.device).repeat_interleave(height * width * KERNEL**2)
+        image = torch.arange(batch, device=x.device).repeat_interleave(
+            height * width * KERNEL**2
+        )
         seen = sampled(x, positions.flatten(0, 3), image)  # (B h w 9, C)
         seen = seen.view(batch, height, width, -1)  # (B, h, w, 9 C)
-        weight = self.weight.permute(0, 2, 3, 1).flatten(1)  # (out, 9 C): tap by tap, like samples
+        weight = self.weight.permute(0, 2, 3, 1).flatten(
+            1
+        )  # (out, 9 C): tap by tap, like samples
         return as_map(linear(seen, weight, self.bias)).to(x.dtype)

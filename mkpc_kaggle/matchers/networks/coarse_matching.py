@@ -117,7 +117,9 @@ def row_and_column_maxima(cells: Cells) -> tuple[Tensor, Tensor, Tensor]:
     """Return each row's maximum (L,) and its column (L,), and each column's maximum (S,)."""
     of_rows = []
     partners = []
-    of_columns = cells.features1.new_full(cells.content1.shape, -torch.inf, dtype=torch.float32)
+    of_columns = cells.features1.new_full(
+        cells.content1.shape, -torch.inf, dtype=torch.float32
+    )
     for block in half_log_confidences(cells):
         best, partner = block.max(dim=1)
         of_rows.append(best)

@@ -15,7 +15,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.networks.dinov2 import DinoV2
-from mkpc_kaggle.matchers.networks.layers import ExactConv2d, depthwise_block, in_strips, resize
+from mkpc_kaggle.matchers.networks.layers import (
+    ExactConv2d,
+    depthwise_block,
+    in_strips,
+    resize,
+)
 from mkpc_kaggle.matchers.networks.vgg import VGG19, Vgg
 
 REACH = 2  # pixels that a depthwise convolution reads on each side
@@ -58,7 +63,9 @@ class DedodeRefiner(nn.Module):
             nn.ReLU(inplace=True),
             nn.Conv2d(width, width, 1),
         )
-        self.hidden_blocks = nn.Sequential(*(depthwise_block(width, width) for _ in range(blocks)))
+        self.hidden_blocks = nn.Sequential(
+            *(depthwise_block(width, width) for _ in range(blocks))
+        )
         self.out_conv = ExactConv2d(width, prediction + shape.context, 1)
 
     def entry(self, features: Tensor) -> Tensor:
@@ -104,14 +111,18 @@ class DedodeDecoder(nn.Module):
     Predictions are upsampled in ``mode``: bilinear for descriptors, bicubic for DaD's logits.
     """
 
-    def __init__(self, strides: Sequence[int], prediction: int, blocks: int, mode: str) -> None:
+    def __init__(
+        self, strides: Sequence[int], prediction: int, blocks: int, mode: str
+    ) -> None:
         super().__init__()
         self.prediction = prediction
         self.mode = mode
         self.layers = nn.ModuleDict()
         context = 0
         for stride in strides:
-            self.layers[str(stride)] = DedodeRefiner(SHAPES[stride], context, prediction, blocks)
+            self.layers[str(stride)] = DedodeRefiner(
+                SHAPES[stride], context, prediction, blocks
+            )
             context = SHAPES[stride].context
 
     def at(self, stride: int) -> DedodeRefiner:

@@ -61,7 +61,9 @@ class DenseWarp(NamedTuple):
 class WarpDecoder(nn.Module, ABC):
     """A decoder from the features of two images to the flow between them."""
 
-    def forward(self, query: DenseFeatures, support: DenseFeatures) -> tuple[WarpEstimate, Tensor]:
+    def forward(
+        self, query: DenseFeatures, support: DenseFeatures
+    ) -> tuple[WarpEstimate, Tensor]:
         """Return the last pass's estimate at stride 1, and the first pass's logits at stride 16.
 
         The estimate is from query to support.
@@ -75,7 +77,9 @@ class WarpDecoder(nn.Module, ABC):
             estimate = self.refine(estimate, query.fine, support.fine)
         return estimate, logits
 
-    def refine(self, estimate: WarpEstimate, query: Pyramid, support: Pyramid) -> WarpEstimate:
+    def refine(
+        self, estimate: WarpEstimate, query: Pyramid, support: Pyramid
+    ) -> WarpEstimate:
         """Refine an estimate of any size down to stride 1."""
         for stride in (8, 4, 2, 1):
             # Coordinates are normalised, so a resized flow keeps its values.
@@ -106,7 +110,9 @@ class DenseNetwork(nn.Module, ABC):
         ``fine``: the same images in a larger size, for a second pass.
         """
 
-    def match(self, first: DenseFeatures, second: DenseFeatures) -> tuple[DenseWarp, DenseWarp]:
+    def match(
+        self, first: DenseFeatures, second: DenseFeatures
+    ) -> tuple[DenseWarp, DenseWarp]:
         """Return the warps of B pairs on the first and on the second image's grid.
 
         Sizes may differ.

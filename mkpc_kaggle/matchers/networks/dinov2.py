@@ -34,7 +34,9 @@ class DinoV2(nn.Module):
         # For training only; it exists because checkpoints have it.
         self.mask_token = nn.Parameter(torch.zeros(1, WIDTH))
         self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, WIDTH, PATCH, PATCH)})
-        blocks = (VitBlock(WIDTH, HEADS, EPSILON, bias=True, scaled=True) for _ in range(BLOCKS))
+        blocks = (
+            VitBlock(WIDTH, HEADS, EPSILON, bias=True, scaled=True) for _ in range(BLOCKS)
+        )
         self.blocks = nn.ModuleList(blocks)
         self.norm = nn.LayerNorm(WIDTH, EPSILON)
         self.eval().requires_grad_(False)
@@ -59,10 +61,14 @@ class DinoV2(nn.Module):
         The stored grid is resampled by factors slightly above the ratios of the sides, as in
         training.
         """
-        side = isqrt(self.pos_embed.shape[1])  # the class token's adds less than one to the root
+        side = isqrt(
+            self.pos_embed.shape[1]
+        )  # the class token's adds less than one to the root
         if (height, width) == (side, side):
             return self.pos_embed
-        stored = as_map(self.pos_embed[:, 1:].reshape(1, side, side, -1))  # (1, C, side, side)
+        stored = as_map(
+            self.pos_embed[:, 1:].reshape(1, side, side, -1)
+        )  # (1, C, side, side)
         factor_y = (height + OFFSET) / side
         factor_x = (width + OFFSET) / side
         # Not by ``size``: PyTorch samples at positions that follow from the given factors.
@@ -82,7 +88,9 @@ class VitBlock(nn.Module):
     added term has a learned factor per channel.
     """
 
-    def __init__(self, width: int, heads: int, epsilon: float, *, bias: bool, scaled: bool) -> None:
+    def __init__(
+        self, width: int, heads: int, epsilon: float, *, bias: bool, scaled: bool
+    ) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(width, epsilon)
         self.attn = VitAttention(width, heads, bias)
@@ -127,7 +135,9 @@ class VitPerceptron(nn.Module):
     def forward(self, tokens: Tensor) -> Tensor:
         """Map (B, n, C) to (B, n, C) in the weights' precision."""
         hidden = self.fc1(tokens.to(self.fc1.weight.dtype))
-        out: Tensor = self.fc2(functional.gelu(hidden))  # the exact GELU, not the one with tanh
+        out: Tensor = self.fc2(
+            functional.gelu(hidden)
+        )  # the exact GELU, not the one with tanh
         return out
 
 

@@ -20,7 +20,12 @@ from mkpc_kaggle.matchers.networks.dense_warp import (
     WarpDecoder,
 )
 from mkpc_kaggle.matchers.networks.layers import ExactConv2d, resize
-from mkpc_kaggle.matchers.networks.warp_refiner import SHAPES, WarpEstimate, WarpRefiner, refined
+from mkpc_kaggle.matchers.networks.warp_refiner import (
+    SHAPES,
+    WarpEstimate,
+    WarpRefiner,
+    refined,
+)
 
 STRIDES = (32, 16)  # of the coarse decoder
 # Channels of the coarse decoder.
@@ -132,7 +137,9 @@ class EmbeddingDecoder(nn.Module):
         """
         at = str(stride)
         own = self.feat_input_modules[at](features)
-        joined = torch.cat([own, posterior.to(own.dtype)], dim=1)  # (B, 512, h, w), features first
+        joined = torch.cat(
+            [own, posterior.to(own.dtype)], dim=1
+        )  # (B, 512, h, w), features first
         embedded = self.rrb_d[at](joined)
         context = self.rrb_u[at](self.cab[at](context, embedded))
         found = self.terminal_module[at](context.float())  # (B, 3, h, w): certainty, x, y

@@ -28,7 +28,9 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     rows = x.numel() // x.shape[-1]
     images = next((count for count in IMAGES if rows % count == 0), 1)
     lines = x.reshape(images, 1, rows // images, -1)  # (images, 1, rows / images, C_in)
-    pixels = lines.permute(0, 3, 1, 2)  # a view: channels last in memory, so nothing is copied
+    pixels = lines.permute(
+        0, 3, 1, 2
+    )  # a view: channels last in memory, so nothing is copied
     kernel = weight[:, :, None, None]  # (C_out, C_in, 1, 1)
     mapped = functional.conv2d(pixels, kernel, bias)  # (images, C_out, 1, rows / images)
     as_lines = mapped.permute(0, 2, 3, 1)
@@ -138,7 +140,9 @@ class Assignment(NamedTuple):
 
 def mutual_matches(log_scores: Tensor, threshold: float) -> Assignment:
     """Return mutually best pairs of ``log_scores`` (N0, N1) with a score above ``threshold``."""
-    best0, partner0 = log_scores.max(dim=1)  # (N0,): the best score, and its keypoint in image 1
+    best0, partner0 = log_scores.max(
+        dim=1
+    )  # (N0,): the best score, and its keypoint in image 1
     partner1 = log_scores.argmax(dim=0)  # (N1,)
     scores = best0.exp()
     index0 = torch.arange(len(partner0), device=log_scores.device)

@@ -209,7 +209,9 @@ class LightGlue(nn.Module):
         is_identity = shape.descriptor == channels
         self.input_proj = nn.Identity() if is_identity else Linear(shape.descriptor, channels)
         self.posenc = RotaryEmbedding(shape.positions, channels // heads)
-        self.transformers = nn.ModuleList(TransformerLayer(channels, heads) for _ in range(layers))
+        self.transformers = nn.ModuleList(
+            TransformerLayer(channels, heads) for _ in range(layers)
+        )
         # A run that stops early needs the assignment of the layer at which it stops; pruning needs
         # each layer's matchability.
         assignments = range(layers) if self.adapts else [layers - 1]
@@ -224,7 +226,11 @@ class LightGlue(nn.Module):
         self.eval().requires_grad_(False)
 
     def forward(
-        self, positions0: Tensor, descriptors0: Tensor, positions1: Tensor, descriptors1: Tensor
+        self,
+        positions0: Tensor,
+        descriptors0: Tensor,
+        positions1: Tensor,
+        descriptors1: Tensor,
     ) -> Assignment:
         """Return mutual matches that score above the threshold, by ascending ``index0``.
 
@@ -284,7 +290,9 @@ class LightGlue(nn.Module):
         unsure = int((confidence < self._threshold(layer)).sum())
         return 1 - unsure / total > self.depth
 
-    def _kept(self, x: Tensor, n0: int, confidence: Tensor | None, layer: int) -> Tensor | None:
+    def _kept(
+        self, x: Tensor, n0: int, confidence: Tensor | None, layer: int
+    ) -> Tensor | None:
         """Return the indices of the keypoints to keep, or ``None`` if no image is pruned."""
         fewest = MIN_PRUNED_KEYPOINTS.get(x.device.type, 0)
         prunes0 = n0 > fewest

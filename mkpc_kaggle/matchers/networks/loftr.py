@@ -27,7 +27,9 @@ class LoftrTransformer(LinearTransformer):
         grid1 = with_positions(coarse1, self.decay)
         # Linear attention has no notion of rows and columns: cells become tokens (N, h w, 256).
         flat_masks = None if masks is None else (masks[0].flatten(1), masks[1].flatten(1))
-        tokens0, tokens1 = super().forward(grid0.flatten(1, 2), grid1.flatten(1, 2), flat_masks)
+        tokens0, tokens1 = super().forward(
+            grid0.flatten(1, 2), grid1.flatten(1, 2), flat_masks
+        )
         return tokens0.view_as(grid0), tokens1.view_as(grid1)
 
 

@@ -12,7 +12,11 @@ from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.layers import Assignment, Linear, mutual_matches
-from mkpc_kaggle.matchers.networks.lightglue import RotaryEmbedding, TransformerLayer, log_scores
+from mkpc_kaggle.matchers.networks.lightglue import (
+    RotaryEmbedding,
+    TransformerLayer,
+    log_scores,
+)
 
 HEAD = 64  # channels of an attention head
 LAYERS = 9
@@ -47,7 +51,9 @@ class LomaMatcher(nn.Module):
         self.log_assignment = nn.ModuleDict({str(LAYERS - 1): assignment})
         self.eval().requires_grad_(False)
 
-    def forward(self, image0: LomaKeypoints, image1: LomaKeypoints, threshold: float) -> Assignment:
+    def forward(
+        self, image0: LomaKeypoints, image1: LomaKeypoints, threshold: float
+    ) -> Assignment:
         """Return mutual matches scored above the threshold; none if an image has no keypoints."""
         n0 = len(image0.points)
         if n0 == 0 or len(image1.points) == 0:

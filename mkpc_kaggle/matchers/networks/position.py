@@ -52,6 +52,8 @@ def with_positions(coarse: Tensor, decay: float) -> Tensor:
 def _waves(length: int, scale: float, frequency: Tensor) -> Tensor:
     """Return (length, 64, 2): sine and cosine at each position of one axis."""
     # Published positions count from one, and are scaled after that.
-    positions = torch.arange(1, length + 1, dtype=torch.float32, device=frequency.device) * scale
+    positions = (
+        torch.arange(1, length + 1, dtype=torch.float32, device=frequency.device) * scale
+    )
     angles = positions[:, None] * frequency  # (length, 64)
     return torch.stack([angles.sin(), angles.cos()], dim=-1)

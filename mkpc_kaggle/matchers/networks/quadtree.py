@@ -109,7 +109,9 @@ def quadtree_attention(
 
     # Broadcasting over 2x2 blocks adds a cell's message to its children's.
     coarse = dense[:, 0, :, None] * shares[0]  # (B, h0 w0, 1, D)
-    merged = from_2x2_blocks(coarse + middle * shares[1], 2 * h0, 2 * w0)  # (B, 2 h0, 2 w0, D)
+    merged = from_2x2_blocks(
+        coarse + middle * shares[1], 2 * h0, 2 * w0
+    )  # (B, 2 h0, 2 w0, D)
     total = fine * shares[2] + merged.flatten(1, 2)[:, :, None]  # (B, 4 h0 w0, 4, D)
     return from_2x2_blocks(total, 4 * h0, 4 * w0)
 
@@ -165,7 +167,9 @@ class ConvolutionalMlp(nn.Module):
 
     def forward(self, grid: Tensor) -> Tensor:
         """Map (N, h, w, C) to (N, h, w, C)."""
-        hidden = functional.relu_(self.fc1(grid.to(self.fc1.weight.dtype)))  # (N, h, w, hidden)
+        hidden = functional.relu_(
+            self.fc1(grid.to(self.fc1.weight.dtype))
+        )  # (N, h, w, hidden)
         mixed = as_grid(self.dwconv["dwconv"](as_map(hidden)))
         out: Tensor = self.fc2(functional.gelu(mixed))  # the exact GELU
         return out.to(grid.dtype)

@@ -70,7 +70,9 @@ class ResNetFpn(nn.Module):
         self.conv1 = nn.Conv2d(1, STEM, 7, 2, 3, bias=False)
         self.bn1 = nn.BatchNorm2d(STEM)
         self.layer1 = nn.Sequential(ResidualBlock(STEM, STEM), ResidualBlock(STEM, STEM))
-        self.layer2 = nn.Sequential(ResidualBlock(STEM, MIDDLE, 2), ResidualBlock(MIDDLE, MIDDLE))
+        self.layer2 = nn.Sequential(
+            ResidualBlock(STEM, MIDDLE, 2), ResidualBlock(MIDDLE, MIDDLE)
+        )
         self.layer3 = nn.Sequential(ResidualBlock(MIDDLE, TOP, 2), ResidualBlock(TOP, TOP))
         self.layer3_outconv = nn.Conv2d(TOP, TOP, 1, bias=False)
         self.layer2_outconv = nn.Conv2d(MIDDLE, TOP, 1, bias=False)
@@ -82,7 +84,9 @@ class ResNetFpn(nn.Module):
 
     def forward(self, image: Tensor) -> FeatureMaps:
         image = image.to(self.conv1.weight.dtype)
-        half = self.layer1(functional.relu_(self.bn1(self.conv1(image))))  # (B, 128, H/2, W/2)
+        half = self.layer1(
+            functional.relu_(self.bn1(self.conv1(image)))
+        )  # (B, 128, H/2, W/2)
         quarter = self.layer2(half)  # (B, 196, H/4, W/4)
         coarse = self.layer3_outconv(self.layer3(quarter))  # (B, 256, H/8, W/8)
         lateral = self.layer2_outconv(quarter).add_(_doubled(coarse))  # (B, 256, H/4, W/4)

@@ -141,7 +141,9 @@ class AnchorDecoder(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        blocks = (VitBlock(width, HEADS, EPSILON, bias=False, scaled=False) for _ in range(BLOCKS))
+        blocks = (
+            VitBlock(width, HEADS, EPSILON, bias=False, scaled=False) for _ in range(BLOCKS)
+        )
         self.blocks = nn.ModuleList(blocks)
         self.to_out = ExactLinear(width, SIDE**2 + 1)
 

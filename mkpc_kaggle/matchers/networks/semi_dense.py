@@ -45,7 +45,9 @@ class SemiDenseNetwork(nn.Module):
         self.backbone = ResNetFpn()
         self.loftr_coarse = loftr_coarse
         self.border = border
-        learned = {"temperature": torch.tensor(1 / TEMPERATURE)} if learned_temperature else {}
+        learned = (
+            {"temperature": torch.tensor(1 / TEMPERATURE)} if learned_temperature else {}
+        )
         self.coarse_matching = nn.ParameterDict(learned)
         self.fine_preprocess = FinePreprocess(TOP, FINE)
         self.loftr_fine = LinearTransformer(FINE, HEADS, cycles=1)

@@ -112,8 +112,12 @@ class SuperGlue(nn.Module):
         super().__init__()
         self.sinkhorn_iterations = sinkhorn_iterations
         self.match_threshold = match_threshold
-        self.kenc = nn.ModuleDict({"encoder": pointwise_network(3, 32, 64, 128, 256, CHANNELS)})
-        layers = nn.ModuleList(SuperGlueLayer(cross=index % 2 == 1) for index in range(LAYERS))
+        self.kenc = nn.ModuleDict(
+            {"encoder": pointwise_network(3, 32, 64, 128, 256, CHANNELS)}
+        )
+        layers = nn.ModuleList(
+            SuperGlueLayer(cross=index % 2 == 1) for index in range(LAYERS)
+        )
         self.gnn = nn.ModuleDict({"layers": layers})
         self.final_proj = Pointwise(CHANNELS, CHANNELS)
         self.bin_score = nn.Parameter(torch.tensor(1.0))  # the score of being unmatched

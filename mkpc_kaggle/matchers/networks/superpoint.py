@@ -84,7 +84,9 @@ class SuperPoint(nn.Module):
         found = []
         for of_image, field in zip(scores, self.descriptor_field(features), strict=True):
             points, kept = self.select_keypoints(of_image)
-            found.append(SuperPointKeypoints(points, kept, sample_descriptors(field, points), size))
+            found.append(
+                SuperPointKeypoints(points, kept, sample_descriptors(field, points), size)
+            )
         return found
 
     def features(self, image: Tensor) -> Tensor:

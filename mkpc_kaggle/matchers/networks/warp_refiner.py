@@ -63,13 +63,17 @@ class WarpRefiner(nn.Module):
         super().__init__()
         self.radius = shape.radius
         window = 0 if shape.radius is None else (2 * shape.radius + 1) ** 2
-        self.block1 = depthwise_block(2 * shape.features + shape.embedding + window, shape.hidden)
+        self.block1 = depthwise_block(
+            2 * shape.features + shape.embedding + window, shape.hidden
+        )
         blocks = (depthwise_block(shape.hidden, shape.hidden) for _ in range(HIDDEN_BLOCKS))
         self.hidden_blocks = nn.Sequential(*blocks)
         self.out_conv = ExactConv2d(shape.hidden, 3, 1)
         self.disp_emb = ExactConv2d(2, shape.embedding, 1)
 
-    def forward(self, query: Tensor, support: Tensor, flow: Tensor, stretch: float = 1) -> Tensor:
+    def forward(
+        self, query: Tensor, support: Tensor, flow: Tensor, stretch: float = 1
+    ) -> Tensor:
         """Return corrections (B, 3, h, w) of a flow (B, 2, h, w).
 
         Features are (B, C, h, w) of the query and (B, C, h', w') of the support. Displacements are
@@ -128,11 +132,15 @@ def local_correlation(query: Tensor, support: Tensor, flow: Tensor, radius: int)
     height, width = size
     height1, width1 = support.shape[2:]
     flows = as_grid(flow).reshape(-1, 2)  # (P, 2), P = B h w
-    targets = ((flows + 1) * flow.new_tensor([width1, height1]) - 1) / 2  # pixels of the support
+    targets = (
+        (flows + 1) * flow.new_tensor([width1, height1]) - 1
+    ) / 2  # pixels of the support
     # In pixels of the support, a step is the ratio of the two sizes.
     columns, along_x = taps(targets[:, 0], width1, width1 / width, radius)
     rows, along_y = taps(targets[:, 1], height1, height1 / height, radius)
-    image = torch.arange(len(query), device=flow.device).repeat_interleave(size.numel())  # (P,)
+    image = torch.arange(len(query), device=flow.device).repeat_interleave(
+        size.numel()
+    )  # (P,)
     lines = (image[:, None] * height1 + rows) * width1  # (P, Ky): first pixels of the lines
     index = lines[:, :, None] + columns[:, None]  # (P, Ky, Kx)
 
