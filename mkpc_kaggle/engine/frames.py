@@ -6,7 +6,7 @@ They are all that reports, the summary, notebooks and scores read.
 import json
 from base64 import b64decode
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -102,10 +102,8 @@ class Results:
             for pair in pairs:
                 row: Any = known.loc[pair]
                 used = self.units[self.units["pair"] == pair]
-                columns = "key, data, regions"
-                stored = {
-                    key: more for key, *more in store.select("points", columns, used["key"])
-                }
+                found = store.select("points", "key, data, regions", used["key"])
+                stored = {key: more for key, *more in found}
                 rows = []
                 for unit in used.to_dict("records"):
                     data, regions = stored.get(unit["key"], (None, ""))
@@ -183,7 +181,7 @@ def results_of(store: Store) -> Results:
     images = frame_of(store, IMAGES)
     records = store.facts(key for _, key, _ in stored)
     scenes = [
-        SceneRecord.from_json(records[key])
+        replace(SceneRecord.from_json(records[key]), batch=batch)
         if key in records
         else SceneRecord(batch, failure=failure)
         for batch, key, failure in stored

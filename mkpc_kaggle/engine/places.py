@@ -58,9 +58,9 @@ class Place:
     def is_idle(self) -> bool:
         return self.worker is not None and self.is_loaded and self.job is None
 
-    @property
-    def may_start(self) -> bool:
-        return self.worker is None and not self.closed
+    def may_start(self, now: float) -> bool:
+        # After losses in a row it waits: scarce memory may become free meanwhile.
+        return self.worker is None and not self.closed and now >= self.since + self.strikes
 
     def start(self, now: float) -> None:
         """Start a worker. Its first answer says whether it is loaded."""
@@ -157,11 +157,10 @@ class Site:
         """Return the places of a kind that are not closed."""
         return [place for place in self.places if place.kind is kind and not place.closed]
 
-    @property
-    def free(self) -> list[Place]:
-        """The places that can take a job: those with an idle worker, then those that may start one."""
+    def free(self, now: float) -> list[Place]:
+        """Return the places that can take a job: those with an idle worker, then those that may start one."""
         places = [place for place in self.places if place.is_idle]
-        return places + [place for place in self.places if place.may_start]
+        return places + [place for place in self.places if place.may_start(now)]
 
     def has_other(self, place: Place) -> bool:
         """Return whether another place can do what a place for matching does."""

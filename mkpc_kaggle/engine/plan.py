@@ -233,8 +233,6 @@ class Plan:
         with a lost job last.
         """
         state = self.state
-        if not self.crew.estimators:
-            return []
         order = state.order[self._due[state.order]]
         rank = state.has_f[order] + 2 * (state.losses[order, ESTIMATE] > 0)
         return list(order[np.argsort(rank, kind="stable")][:MAX_DUE].tolist())
@@ -245,7 +243,8 @@ class Plan:
         # than the fallback.
         state = self.state
         settled = (self.first >= FILL) & (state.busy == NEVER)
-        return np.asarray(state.lacks_estimate & ~state.estimating & (settled | ~state.has_f))
+        due = state.lacks_estimate & ~state.estimating & (settled | ~state.has_f)
+        return np.asarray(due & bool(self.crew.estimators))
 
     @cached_property
     def scenes(self) -> list[tuple[int, int]]:

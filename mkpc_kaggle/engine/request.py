@@ -217,7 +217,7 @@ class Failure:
     message: str = ""
 
     def __str__(self) -> str:
-        return f"{self.cause}: {self.message}" if self.message else str(self.cause)
+        return f"{self.cause}: {self.message}".removesuffix(": ")
 
 
 # The answer to a match job or an estimate job has a value for each pair, in the order of the job. A matched

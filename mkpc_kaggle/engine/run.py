@@ -8,7 +8,6 @@ import logging
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from typing import cast
 
 import numpy as np
@@ -60,7 +59,6 @@ from mkpc_kaggle.setup.console import Progress, logger
 # message and a transaction, would cost the loop more.
 MAX_ESTIMATES = 8
 MAX_LOSSES = 3  # of a place in a row, without an answer in between
-MAX_FAULTS = 1000  # with different texts
 
 
 @dataclass(eq=False)
@@ -83,8 +81,6 @@ class Run:
         self.about = state.request.about
         self.about.resumed = int((state.done.all(1) & state.estimated)[: state.rows].sum())
         self.publication = Publication(state, self.store, self.budget)
-        # For the report: an interrupted program has two seconds for it, and the import takes one.
-        import_module("pandas")
 
     def report(self) -> Results:
         """Run, end all workers, and publish for the last time. Return the results."""
@@ -114,7 +110,7 @@ class Run:
             if self.site.fallback and (self.site.is_closed or self.state.dead.all()):
                 self._fall_back()
             plan = self.plan(now)
-            for place in self.site.free:
+            for place in self.site.free(now):
                 self._give(place, plan)
             if not (plan.match or plan.estimates or plan.scenes or self.site.has_jobs):
                 break
@@ -155,6 +151,7 @@ class Run:
         place.job = None
         if isinstance(answer, Failure):
             self.lose(place, job, answer)
+            place.since = now
         elif job is not None:
             place.note_answer()
             self.save(job, answer, now - place.since)
@@ -372,8 +369,10 @@ class Run:
         state = self.state
         dead = state.unit_losses > max(1, len(self.site.of(Kind.MATCH)))
         for unit in np.flatnonzero(dead & ~state.dead).tolist():
-            name = state.units[unit].name
-            self.fault(f"{name} is skipped on all pairs: it never ran ({failure})")
+            text = (
+                f"{state.units[unit].name} is skipped on all pairs: it never ran ({failure})"
+            )
+            self.fault(text)
         state.dead = dead
 
     def _close(self, place: Place, failure: Failure) -> None:
@@ -392,8 +391,8 @@ class Run:
     def _fall_back(self) -> None:
         """Continue on the fallback places: all matching places are closed, or every unit is skipped."""
         reason = self.site.reason or Ending.NOTHING_RUNS
-        name = self.site.fallback[0].name
-        self.fault(f"matching continues on the {name}: {reason}", logging.WARNING)
+        text = f"matching continues on the {self.site.fallback[0].name}: {reason}"
+        self.fault(text, logging.WARNING)
         self.site.fall_back()
         # Costs, losses and refusals say nothing about the other device.
         self.costs = Costs()
@@ -404,7 +403,7 @@ class Run:
     def fault(self, text: str, level: int = logging.DEBUG) -> None:
         """Record a fault, if any, once for each text: a broken disk would fill the log with them."""
         faults = self.about.faults
-        if text and text not in faults and len(faults) < MAX_FAULTS:
+        if text and text not in faults:
             faults.append(text)
             logger.log(level, text)
 
@@ -424,9 +423,6 @@ class Run:
             return Ending.NOTHING_RUNS
         if is_complete(state, self.crew):
             return Ending.WITH_FAILURES if state.has_failures else Ending.COMPLETE
-        has_estimators = bool(self.site.of(Kind.ESTIMATE))
-        return (
-            Ending.TIME_IS_UP
-            if has_estimators and not self.site.is_closed
-            else Ending.NO_WORKER
-        )
+        if self.site.is_closed or not self.site.of(Kind.ESTIMATE):
+            return Ending.NO_WORKER
+        return Ending.TIME_IS_UP

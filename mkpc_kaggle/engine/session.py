@@ -1,7 +1,6 @@
 """Assembly of a run: store, site, signal handling, and the end at the time limit."""
 
 import hashlib
-import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,7 +19,7 @@ from mkpc_kaggle.data.competition import (
     submission_problem,
     write_submission,
 )
-from mkpc_kaggle.data.outputs import remove_unfinished
+from mkpc_kaggle.data.outputs import remove_unfinished, replacing
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RaySite
 from mkpc_kaggle.engine.frames import Results
@@ -128,13 +127,16 @@ def first_version(pairs: Sequence[Pair], output: Path, work_dir: Path) -> None:
     with writing(f"--output {output}"):
         output.parent.mkdir(parents=True, exist_ok=True)
         TemporaryFile(dir=output.parent).close()  # before hours of work, not after them
-        if output.is_file() and not submission_problem(output, ids):
-            # By content: a run that begins often keeps each version once.
-            name = hashlib.blake2b(output.read_bytes(), digest_size=4).hexdigest()
-            work_dir.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(output, work_dir / f"earlier-{name}.csv")
-        else:
+        if not output.is_file() or submission_problem(output, ids):
             write_submission(output, dict.fromkeys(ids, FALLBACK_FUNDAMENTAL))
+            return
+    # By content: a run that begins often keeps each version once. A full disk costs the copy, not the run.
+    text = output.read_text()
+    name = hashlib.blake2b(text.encode(), digest_size=4).hexdigest()
+    with suppress(OSError):
+        work_dir.mkdir(parents=True, exist_ok=True)
+        with replacing(work_dir / f"earlier-{name}.csv") as copy:
+            copy.write(text)
 
 
 def submit(

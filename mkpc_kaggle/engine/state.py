@@ -352,7 +352,8 @@ class State:
         made[number] = record
         finished = {each.candidate: each for each in made if each is not None}
         best = best_of({name: finished[name].disagreement for name in finished})
-        scene = self.scenes[record.batch] = finished[best]
+        # Under today's name: a folder that was renamed keeps its results.
+        scene = self.scenes[list(self.batches)[batch]] = finished[best]
         members = np.flatnonzero(self.batch_of == batch)
         self.dirty[members] = True
         self.scene_source[members] = FALLBACK  # of the former scene

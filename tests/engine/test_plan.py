@@ -270,6 +270,13 @@ def test_a_first_scene_does_not_wait_for_a_job_that_hangs_until_the_end():
     assert run.plan(stop).scenes == []
 
 
+def test_scenes_do_not_wait_for_estimates_that_nobody_makes():
+    run = Planned(6, limit=1000.0, had=[UNITS] * 6, recipe=WITH_SCENE)
+    assert run.plan().scenes == []
+    run.crew = replace(run.crew, estimators=0)
+    assert run.plan().scenes == [(0, 0)]
+
+
 def units_of(ran):
     """The number of results of units of all pairs."""
     return int((ran.report.units["failure"] == "").sum())

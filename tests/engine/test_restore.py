@@ -151,3 +151,10 @@ def test_rows_of_the_same_images_share_their_points_and_turned_images_are_others
     assert rows["source"].tolist() == ["pair", "fallback", "pair"]
     room.ask(pairs=[replace(pairs[0], turns=(1, 0))])
     assert not room.state.done.any()
+
+
+def test_a_batch_under_another_name_keeps_its_scene(whole: Room) -> None:
+    whole.ask(pairs=[replace(pair_of(number), group="renamed") for number in range(3)])
+    assert list(whole.state.scenes) == ["renamed"]
+    whole.publish()
+    assert set(results_of(whole.store).cameras["batch"]) == {"renamed"}

@@ -30,7 +30,7 @@ SETTINGS = {  # as a user would edit them
 
 def figures_of(notebook: nbformat.NotebookNode) -> int:
     code = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
-    return sum(source.count("show(figures.") for source in code)
+    return sum(len(re.findall(r"show\(\s*figures\.", source)) for source in code)
 
 
 @needs_namespaces

@@ -311,14 +311,16 @@ class SimulatedSite(Site):
 
     def wait(self, until: float) -> None:
         now = self.clock.now
-        moment = min([until, *(worker.ready for worker in self.workers)])
+        pauses = [place.since + place.strikes for place in self.places if not place.worker]
+        later = [pause for pause in pauses if pause > now]
+        moment = min([until, *later, *(worker.ready for worker in self.workers)])
         # Hung jobs end by their own limits.
         assert moment < math.inf or self.has_jobs, "the engine waits for ever"
         moment = min(moment, self.clock.now + WAKE_S)
         if any(place.job for place in self.of(Kind.SCENE)):
             # After a loss, a place gets another worker only when there is work for it.
             now = self.clock.now
-            idle = sum(place.is_idle or place.may_start for place in self.of(Kind.MATCH))
+            idle = sum(place.is_idle or place.may_start(now) for place in self.of(Kind.MATCH))
             self.for_scenes += idle * max(0.0, min(moment, self.stop) - now)
         self.clock.now = max(self.clock.now, moment)
 
