@@ -57,4 +57,4 @@ def test_a_run_whose_workers_are_killed_at_random_moments_ends_as_the_undisturbe
         assert written(report) == written(undisturbed)
         faults += report.about.faults
     assert faults
-    assert all("signal SIGKILL" in fault for fault in faults)
+    assert all("the worker died" in fault for fault in faults)
