@@ -202,10 +202,8 @@ def table(name: str, given: argparse.Namespace) -> Iterator[str]:
     is_imc = name == "imc"
     if is_imc:
         ours = ["mAA"]
-        theirs = [
-            "public",
-            "private",
-        ]  # of the leaderboard; one score of ours is compared to both
+        # Of the leaderboard; one score of ours is compared to both
+        theirs = ["public", "private"]
     else:
         theirs = [f"AUC {limit:g}" for limit in AUC_THRESHOLDS]
         ours = [*theirs, "precision", "matching score"]

@@ -9,9 +9,8 @@ from io import BufferedReader
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-MAX_TEXT_BYTES = (
-    1 << 24
-)  # a recipe, a list of pairs; a file given by mistake may have gigabytes
+# A recipe, a list of pairs; a file given by mistake may have gigabytes
+MAX_TEXT_BYTES = 1 << 24
 
 
 class UserError(Exception):

@@ -91,9 +91,8 @@ class Case:
     fault: Fault = Fault.NONE
     places: int = 1
     is_killed: bool = False  # the worker of matching, after its first matches
-    seconds: float = (
-        30.0  # that it needs on an H100: each start of a worker takes five or more
-    )
+    # That it needs on an H100: each start of a worker takes five or more
+    seconds: float = 30.0
 
 
 def undisturbed(outcome: Outcome) -> list[str]:

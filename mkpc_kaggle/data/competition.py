@@ -42,14 +42,11 @@ class Pair:
 
     id: str  # unique in a run
     group: str  # its batch or scene
-    file0: (
-        str  # paths of the images; text saves memory, since a table may have a million rows
-    )
+    # Paths of the images; text saves memory, since a table may have a million rows
+    file0: str
     file1: str
-    turns: tuple[int, int] = (
-        0,
-        0,
-    )  # counter-clockwise quarter turns of each image before matching
+    # Counter-clockwise quarter turns of each image before matching
+    turns: tuple[int, int] = (0, 0)
 
     @property
     def images(self) -> tuple[Path, Path]:

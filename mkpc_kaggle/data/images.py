@@ -62,12 +62,8 @@ PLANE_UNIT = 0xA210
 RECORDED_SIDES = 0xA002, 0xA003  # width and height in pixels when the photograph was taken
 FOCAL_35MM = 0xA405
 FILM_MM = 43.27  # diagonal of 35 mm film
-UNITS_MM: dict[float, float] = {
-    2: 25.4,
-    3: 10.0,
-    4: 1.0,
-    5: 0.001,
-}  # inch, cm, mm, micrometre
+# Inch, cm, mm, micrometre
+UNITS_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 # In long sides of the image; a focal length outside this range counts as unknown.
 EXIF_FOCALS = Range(0.2, 20.0)
 # Ratio of the shapes of a stored and a recorded picture; more is a crop, and not rounding.

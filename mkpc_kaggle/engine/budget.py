@@ -71,7 +71,7 @@ class Budget:
 
     @property
     def reserve(self) -> float:
-        """Seconds at the end, most of which have no new unit."""
+        """Seconds at the end in which no unit begins."""
         # At least 1.5 s for the ends of processes, even in runs of a minute.
         return min(max(1.5, 0.005 * self.time_limit), 60.0)
 

@@ -27,9 +27,8 @@ if TYPE_CHECKING:
 
 NOT_REACHED = "not reached in time"
 TOO_FEW = "at least three matched images are needed"
-ELEMENTS = [
-    f"f{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)
-]  # of F, row by row
+# Of F, row by row
+ELEMENTS = [f"f{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)]
 SCENE_COLUMNS = [
     "batch",
     "images",

@@ -3,8 +3,8 @@
 A :class:`Plan` has no queue and no memory. The first unit runs on all pairs (sweep), then on extra pairs
 (connect), then the units that fit for all pairs (deepen), then the others, weakest pairs first (fill).
 
-A unit no longer fits in time by two rules. The time left ends before
-the estimates, scenes and candidates that are still due, for which up to a fifth of the limit is reserved.
+A unit no longer fits in time by two rules. The time left ends before the estimates, scenes and candidates that are
+still due, for which up to a fifth of the limit is reserved.
 
 - The prefix that fits: a unit whose forecast, with those of the units before it, for all missing pairs exceeds the
   time left of all workers waits for the last phase, unless it is the unit of the sweep. A unit of stage 2 counts

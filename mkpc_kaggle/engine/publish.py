@@ -11,9 +11,8 @@ from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.state import FALLBACK, SOURCES, State
 from mkpc_kaggle.engine.store import Store
 
-INTERVAL_S = (
-    30.0  # between versions: a run that is killed loses at most this from its submission
-)
+# Between versions: a run that is killed loses at most this from its submission
+INTERVAL_S = 30.0
 TIME_SHARE = 0.05  # maximum share of the time for writing versions, if a disk is slow
 
 

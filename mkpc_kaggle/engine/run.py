@@ -82,10 +82,10 @@ class Run:
         self.about.resumed = int((state.done.all(1) & state.estimated)[: state.rows].sum())
         self.publication = Publication(state, self.store, self.budget)
 
-    def report(self) -> Results:
-        """Run, end all workers, and publish for the last time. Return the results."""
+    def run(self) -> Results:
+        """Run until nothing is left to do or time is over, and end all workers. Return the results."""
         try:
-            self.run()
+            self._loop()
         finally:
             self.site.close()
             self.progress.close()
@@ -98,7 +98,7 @@ class Run:
 
     # The loop
 
-    def run(self) -> None:
+    def _loop(self) -> None:
         self._publish()
         while not self.budget.is_over(self.interrupt):
             now = self.budget.clock()

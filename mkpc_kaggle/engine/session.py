@@ -1,4 +1,4 @@
-"""Assembly of a run: store, site, signal handling, and the end at the time limit."""
+"""A run from its pairs: the first version, the parts of the run, and the end at the time limit."""
 
 import hashlib
 import threading
@@ -13,12 +13,7 @@ from tempfile import TemporaryFile
 from types import MappingProxyType
 from typing import Self
 
-from mkpc_kaggle.data.competition import (
-    Pair,
-    names_of,
-    submission_problem,
-    write_submission,
-)
+from mkpc_kaggle.data.competition import Pair, names_of, submission_problem, write_submission
 from mkpc_kaggle.data.outputs import remove_unfinished, replacing
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RaySite
@@ -103,7 +98,7 @@ class Session:
             trouble = self.save()
             # A report that is cut off would lie next to the submission.
             with suppress(OSError):
-                remove_unfinished()  # for example, an unfinished report
+                remove_unfinished()
 
         writer = threading.Thread(target=write, name="final write", daemon=True)
         writer.start()  # the disk may hang
@@ -118,8 +113,8 @@ class Session:
 def first_version(pairs: Sequence[Pair], output: Path, work_dir: Path) -> None:
     """Write fallback rows before using weights, devices or images, which may hang.
 
-    A complete file of an earlier run stays, and a copy of it in the work directory, since the next version is that
-    of a run without its results. Raises :class:`mkpc_kaggle.errors.UserError` if ``output`` cannot be written.
+    A complete file of an earlier run stays. The work directory gets a copy, since this run may have fewer results.
+    Raises :class:`mkpc_kaggle.errors.UserError` if ``output`` cannot be written.
     """
     if output.is_char_device() or output.is_block_device():
         raise UserError(f"--output {output} is a device; name a file")
@@ -206,7 +201,7 @@ def run_pairs(
         run = Run(state, site, store, budget, session.interrupt, progress)
         session.save = run.publication.save
         with logged(work_dir / LOG_NAME):
-            return run.report()
+            return run.run()
 
 
 def _site(pairs: Sequence[Pair], assembly: Assembly, session: Session) -> Site:

@@ -13,13 +13,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import Pair, distinct_pairs, names_of, visiting_order
 from mkpc_kaggle.engine.keys import Images, contents_of, of_candidate
-from mkpc_kaggle.engine.request import (
-    Job,
-    MatchJob,
-    PairInputs,
-    Request,
-    SceneJob,
-)
+from mkpc_kaggle.engine.request import Job, MatchJob, PairInputs, Request, SceneJob
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.geometry.crop_need import pays
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, are_models
@@ -56,8 +50,8 @@ class State:
     of each unit, and in the last column of the estimate.
 
     Of a pair (N,): ``estimate``, the key of the estimate in use; ``estimated``, it is today's; ``F`` (N, 3,
-    3), its ``inliers`` and ``has_f``, it is no fallback; ``by_scene`` (N, 3, 3) and ``scene_source``, what
-    the scene in use gives; ``busy``, the phase of a job under way, else ``NEVER``; ``estimating``; ``dirty``,
+    3), its ``inliers`` and ``has_f``, it is no fallback; ``by_scene`` (N, 3, 3) and ``scene_source``, F
+    by the scene in use; ``busy``, the phase of a job under way, else ``NEVER``; ``estimating``; ``dirty``,
     other than in the last table of pairs. ``reasons`` has why a unit (by name), the estimate ("estimate") or
     the pair ("") failed.
 
@@ -86,10 +80,8 @@ class State:
         self.order = np.asarray(visiting_order(self.pairs), int)
         self._start_pairs(len(self.pairs), len(self.units))
         self._start_batches()
-        self.titles = [
-            *(unit.name for unit in self.units),
-            "estimate",
-        ]  # of the columns of losses
+        # Of the columns of losses
+        self.titles = [*(unit.name for unit in self.units), "estimate"]
 
     def _start_pairs(self, count: int, units: int) -> None:
         # Column by column: the plan looks at one unit of all pairs at a time.
@@ -142,6 +134,7 @@ class State:
 
     @property
     def is_row(self) -> Mask:
+        """(N,): a row names the pair."""
         return np.arange(len(self.pairs)) < self.rows
 
     @property
@@ -171,7 +164,7 @@ class State:
     @property
     def scene_matches(self) -> NDArray[np.int_]:
         """The number of matches (B, C) that make a candidate's tracks, about."""
-        columns = dict(zip(self.titles, self.matches.T, strict=False))
+        columns = dict(zip(self.titles[:-1], self.matches.T, strict=True))
         every = self.matches.sum(1)
         counts = [self.by_batch(columns.get(name, every)) for name in self.candidates]
         return np.column_stack(counts)

@@ -34,7 +34,7 @@ WRITE, READ, IMMUTABLE = "mode=rwc", "mode=rw", "immutable=1"
 TABLES = {
     "points": """key TEXT PRIMARY KEY, matches INTEGER, keypoints INTEGER, seconds REAL, scale REAL,
         detail REAL, regions TEXT, note TEXT, data BLOB""",
-    # Estimates, scenes and shortlists, as JSON
+    # Estimates and scenes, as JSON
     "result": "key TEXT PRIMARY KEY, facts TEXT",
     "image": """key TEXT PRIMARY KEY, size INTEGER, changed INTEGER, digest TEXT, width INTEGER, height INTEGER,
         focal REAL""",

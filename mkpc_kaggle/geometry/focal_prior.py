@@ -42,9 +42,8 @@ from mkpc_kaggle.geometry.robust import (
 )
 from mkpc_kaggle.geometry.two_view import Problem, TwoView, Vectors, robust_costs, sampson
 
-ESSENTIAL_STARTS = (
-    5  # estimates of E, at evenly spaced quantiles of the prior on focal lengths
-)
+# Estimates of E, at evenly spaced quantiles of the prior on focal lengths
+ESSENTIAL_STARTS = 5
 # Share and minimum number of the matches for each of them.
 ESSENTIAL_SHARE = 0.25
 MIN_ESSENTIAL = 50
@@ -302,9 +301,8 @@ class _Search:
 
         ``view`` is one of the four poses of F. The one with the fewest points behind counts.
         """
-        saved = 0.5 - robust_costs(
-            sampson(F, *self.rays), self._scale
-        )  # against an outlier's 0.5
+        # An outlier costs 0.5.
+        saved = 0.5 - robust_costs(sampson(F, *self.rays), self._scale)
         behind = []
         for each in (view, view.twisted):
             signs = each.depth_signs(*self.rays, 3 * self._scale)

@@ -60,6 +60,5 @@ class KnownCamera:
         return "FISHEYE" in self.model or any(self.parameters[len(self.focals) + 2 :])
 
 
-Rows = Sequence[
-    tuple[str, KnownCamera]
-]  # the path of an image below its folder, and its camera
+# The path of an image below its folder, and its camera
+Rows = Sequence[tuple[str, KnownCamera]]

@@ -50,9 +50,8 @@ class RobustConfig:
 
     threshold: float = 0.2  # pixels of the stored image
     max_iterations: int = 50_000
-    confidence: float = (
-        0.99999  # probability that no better model remains, where iterations stop
-    )
+    # Probability that no better model remains, where iterations stop
+    confidence: float = 0.99999
 
     def __post_init__(self) -> None:
         check_ranges(self, threshold=POSITIVE, max_iterations=Range(1, 10**6))

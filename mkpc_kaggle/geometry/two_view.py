@@ -107,9 +107,8 @@ class TwoView:
         factors = _focal_factors(self.logs)
         # A small rotation w changes R by [w]x R, a small step along t's tangent changes [t]x.
         turns = cross_matrix(self.t) @ CROSS @ self.R * factors  # (3, 3, 3)
-        shifts = (
-            np.tensordot(self._tangent_basis().T, CROSS, 1) @ self.R * factors
-        )  # (2, 3, 3)
+        # (2, 3, 3)
+        shifts = np.tensordot(self._tangent_basis().T, CROSS, 1) @ self.R * factors
         # Focal length 0 is a factor of F's last column, focal length 1 of its last row.
         by_log0 = np.zeros((3, 3))
         by_log0[:, 2] = F[:, 2]

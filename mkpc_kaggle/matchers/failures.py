@@ -28,9 +28,8 @@ class FailureKind(Enum):
     """The consequence of a matcher's error for the run."""
 
     OUT_OF_MEMORY = auto()  # fewer pairs at a time may fit
-    DEVICE = (
-        auto()
-    )  # this process can no longer compute; the pair or the device may be the cause
+    # This process can no longer compute; the pair or the device may be the cause
+    DEVICE = auto()
     RAISED = auto()  # the matcher cannot process this pair
 
 

@@ -90,9 +90,8 @@ def _nearest(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         groups = similarity.view(len(block), len(filled) // GROUP, GROUP)
         highest = groups.amax(dim=2)  # (rows, groups)
         best, group = highest.max(dim=1)
-        inside = groups.gather(1, group[:, None, None].expand(-1, 1, GROUP))[
-            :, 0
-        ]  # (rows, GROUP)
+        # (rows, GROUP)
+        inside = groups.gather(1, group[:, None, None].expand(-1, 1, GROUP))[:, 0]
         offset = inside.argmax(dim=1)
         # The second nearest is in the same group or has the maximum of another group.
         inside.scatter_(1, offset[:, None], -1.0)

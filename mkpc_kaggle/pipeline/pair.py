@@ -34,9 +34,8 @@ class UnitResult:
     encode_seconds: float = 0.0
     match_seconds: float = 0.0
     failure: str = ""  # the reason for a result without matches
-    warm_up: bool = (
-        False  # the first run of the unit in this process, which may take much longer
-    )
+    # The first run of the unit in this process, which may take much longer
+    warm_up: bool = False
     note: str = ""  # why the unit did not run as written
     keypoints: int = 0  # detected in the first view; 0 for a matcher without a detector
     need: CropNeed | None = None  # of stage 2; one that is not needed has no matches

@@ -15,9 +15,8 @@ if TYPE_CHECKING:
 def require_format(path: Path) -> None:
     """Raise :class:`UserError` if matplotlib is missing or does not support the suffix as a format."""
     # Before hours of matching, and not after them
-    formats = new_figure(1, 1).canvas.get_supported_filetypes().keys() - {
-        "pgf"
-    }  # pgf needs LaTeX
+    # Pgf needs LaTeX
+    formats = new_figure(1, 1).canvas.get_supported_filetypes().keys() - {"pgf"}
     if path.suffix[1:].lower() not in formats:
         raise UserError(
             f"the figure {path} needs a suffix: one of {', '.join(sorted(formats))}"

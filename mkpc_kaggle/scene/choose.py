@@ -30,9 +30,8 @@ from mkpc_kaggle.scene.view_graph import BatchPair
 
 CONTRADICTION_ERROR_PX = 2.0  # maximum Sampson distance of a match that agrees with an F
 CONTRADICTION_MATCHES = 30  # minimum number of matches that agree with the pair's F
-CONTRADICTION_SHARE = (
-    0.05  # minimum share of these matches that must agree with the scene's F
-)
+# Minimum share of these matches that must agree with the scene's F
+CONTRADICTION_SHARE = 0.05
 # The scale of the evidence for an F; larger in images with a longer side
 EVIDENCE_PX, EVIDENCE_SIDE = 1.0, 1536
 EVIDENCE_MATCHES = 60.0  # minimum evidence for the pair's F, of all units

@@ -46,12 +46,10 @@ from mkpc_kaggle.scene.view_graph import (
 
 # Of a verified match; 1 px loses accuracy on tourist photographs, 4 px on repeated windows
 MAX_ERROR_PX = 2.0
-MAX_TRIALS = (
-    300  # RANSAC trials per edge; more trials find the same inliers at five times the cost
-)
-TRACKS_PER_IMAGE = (
-    200  # the longest ones, from which the global mapper starts in a large scene
-)
+# RANSAC trials per edge; more trials find the same inliers at five times the cost
+MAX_TRIALS = 300
+# The longest ones, from which the global mapper starts in a large scene
+TRACKS_PER_IMAGE = 200
 # Of the models with shared intrinsics, as in COLMAP's global mapper
 MAX_REFINEMENTS = 5
 ADJUSTMENT_ITERATIONS = 50  # of each bundle adjustment of a refinement

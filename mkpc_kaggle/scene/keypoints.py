@@ -18,9 +18,8 @@ from mkpc_kaggle.scene.view_graph import ViewGraph
 CELL_PX = 0.75  # points of an image in one cell of this size are one keypoint
 
 
-Index = NDArray[
-    np.uint32
-]  # (M, 2): indices of the matched keypoints in both images of an edge
+# (M, 2): indices of the matched keypoints in both images of an edge
+Index = NDArray[np.uint32]
 
 
 class Lens(NamedTuple):

@@ -14,9 +14,8 @@ from mkpc_kaggle.geometry.intrinsics import KnownCamera, Rows
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 
-MIN_MATCHES = (
-    15  # of a connecting edge; also the minimum number of inliers of a verified edge
-)
+# Of a connecting edge; also the minimum number of inliers of a verified edge
+MIN_MATCHES = 15
 # From units that make tracks; with fewer, a pair uses the matches of all units
 MIN_TRACK_MATCHES = 50
 # The support of an image is the number of inliers of its edge of this rank. A single edge may join

@@ -43,9 +43,8 @@ class Assembly:
     weights: WeightStore
     placement: Placement
     left_out: tuple[str, ...] = ()  # the recipe's matchers without weights
-    matchers: Mapping[str, Matcher[Any]] = field(
-        default_factory=dict
-    )  # the user's ready matchers
+    # The user's ready matchers
+    matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)
     device: str = AUTO  # as named by the user
     sharing: int = 1  # workers on the placement's device
     masks: Masks = field(default_factory=Masks)

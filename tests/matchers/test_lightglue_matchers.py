@@ -79,9 +79,8 @@ def test_layers_compute_in_the_precision_that_is_asked_for(precision, store):
     options = AlikedLightGlueOptions(features=300)
     matcher = load_matcher("aliked_lightglue", store, options, Placement(precision=precision))
     state = matcher._glue.state_dict()
-    is_exact = re.compile(
-        r"posenc|log_assignment|token_confidence|\.ffn\.1\."
-    )  # and layer norms
+    # And layer norms
+    is_exact = re.compile(r"posenc|log_assignment|token_confidence|\.ffn\.1\.")
     half = getattr(torch, precision)
     expected = {name: torch.float32 if is_exact.search(name) else half for name in state}
     assert {name: tensor.dtype for name, tensor in state.items()} == expected

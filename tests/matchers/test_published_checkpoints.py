@@ -40,9 +40,8 @@ LISTS = {
 }
 # Of the same matchers
 OTHERS = {"superglue": {"superpoint": "superpoint"}, "roma": {"dinov2-vitl14": "roma/dinov2"}}
-TABLE = {
-    "matcher.pos_encoding.pe": (1, 256, 256, 256)
-}  # computed; a repackaged file may have it
+# Computed; a repackaged file may have it
+TABLE = {"matcher.pos_encoding.pe": (1, 256, 256, 256)}
 
 
 class Published:

@@ -20,9 +20,8 @@ DATA = Path(__file__).parent / "matches.npz"
 NAMES = [name for name in MATCHERS if name != "sift_lightglue"]
 # Of the matches: a threshold or a tie within rounding may fall the other way on another processor
 SAME = 0.95
-TOLERANCES = np.array(
-    [0.5, *4 * [0.05], 2e-3]
-)  # pair, pixels, score; a row is within all of them
+# Pair, pixels, score; a row is within all of them
+TOLERANCES = np.array([0.5, *4 * [0.05], 2e-3])
 
 
 def found(name):

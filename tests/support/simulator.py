@@ -52,9 +52,8 @@ from mkpc_kaggle.setup.console import Progress
 
 RESTART_S = 8.0  # imports and loading of a worker, about as long as with torch
 ESTIMATE_S = 0.1  # of a pair
-WAKE_S = (
-    1.0  # the longest wait; the real loop wakes every 0.2 s, and may give out other work then
-)
+# The longest wait; the real loop wakes every 0.2 s, and may give out other work then
+WAKE_S = 1.0
 STALL = 20.0  # how many times as long a unit takes that stalls
 SIZE = Size(640, 480)
 MATCHES = 200  # that a unit finds
@@ -583,7 +582,7 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
 
     whole_wait = site.wait
     site.wait = wait
-    report = run.report()
+    report = run.run()
     # A bad pair can have no F, except on the place that takes over.
     bad = list(scenario.fates)
     swept = state.used[: scenario.pairs].any(1)

@@ -12,9 +12,8 @@ class Site:
     """The behaviour of the server; it may be changed between requests. ``asked`` gets each request's path."""
 
     data: bytes
-    breaks: list[int] = field(
-        default_factory=list
-    )  # bytes after which the first connections break
+    # Bytes after which the first connections break
+    breaks: list[int] = field(default_factory=list)
     statuses: list[int] = field(default_factory=list)  # errors that the first requests get
     redirect: str = ""
     asked: list[str] = field(default_factory=list)

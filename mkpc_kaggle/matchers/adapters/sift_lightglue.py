@@ -53,9 +53,8 @@ def sift_encoder(features: int, device: str) -> Encode:
         table = np.array(rows).reshape(-1, 5)
 
         # The first of each pixel in this order is the one to keep.
-        order = np.lexsort(
-            (table[:, 3], -table[:, 4])
-        )  # by descending response, then by angle
+        # By descending response, then by angle
+        order = np.lexsort((table[:, 3], -table[:, 4]))
         pixels = np.rint(table[order, :2] - 0.5)  # the published rounding
         _, first = np.unique(pixels, axis=0, return_index=True)
         kept = np.sort(order[np.sort(first)[:features]])  # the strongest, in OpenCV's order
