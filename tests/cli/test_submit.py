@@ -8,12 +8,15 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from genuine import GENUINE
 from shared import DATA, needs_data, problem_of, run_command, write_small_recipe
 
+from mkpc_kaggle.data.competition import Pair, write_submission
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.frames import results
+from mkpc_kaggle.engine.session import first_version
 from mkpc_kaggle.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -108,6 +111,17 @@ def test_a_whole_submission_exists_before_weights_and_devices_are_searched(
     output.write_text(former)
     assert run_command("submit", "--test-dir", demo.test_dir, "--output", output) == 2
     assert problem_of(output, demo.test_dir) == ""
+
+
+def test_a_former_submission_stays_and_is_copied_where_the_disk_takes_it(tmp_path):
+    output = tmp_path / "submission.csv"
+    write_submission(output, {"x": np.eye(3)})
+    text = output.read_text()
+    first_version([Pair("x", "", "a", "b")], output, tmp_path)
+    (copy,) = tmp_path.glob("earlier-*.csv")
+    # A file for a directory, as a disk that takes nothing
+    first_version([Pair("x", "", "a", "b")], output, copy)
+    assert output.read_text() == copy.read_text() == text
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

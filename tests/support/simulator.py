@@ -612,7 +612,12 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
         and not any(math.isinf(scene.seconds) for scene in site.scenes),
         site.last_job,
         tuple(site.scenes),
-        {batch for batch, number in state.batches.items() if state.stale[number]},
+        {
+            batch
+            for batch, number in state.batches.items()
+            if (made := state.made[number, 0]) is None
+            or made.key != state.scene_inputs(number)[1]
+        },
         [
             [*points, key]
             for points, key in zip(
