@@ -6,6 +6,7 @@ from benchmarks.soak import Process, soak
 from mkpc_kaggle.geometry.coordinates import Size
 
 
+@pytest.mark.slow
 def test_no_process_grows_in_a_run_of_1500_pairs_that_is_resumed(tmp_path):
     # Small pictures: all fit into the caches, which may fill.
     soaked = soak(tmp_path, 1500, workers=2, interval=0.1, size=Size(64, 48))

@@ -3,12 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from pair_lists import write_list
 
 from benchmarks import paper_tables
 from mkpc_kaggle.data.competition import read_train_side
 
 
+@pytest.mark.slow
 def test_the_papers_tables_are_made_with_one_command(demo, tmp_path, capsys):
     (scene,) = read_train_side(demo.train_dir)
     one_pair = replace(scene, pairs=scene.pairs[:1])
