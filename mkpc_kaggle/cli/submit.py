@@ -15,7 +15,7 @@ from mkpc_kaggle.signals import interruptible
 HELP = """\
 Match every pair of test.csv and write one row per pair, its fundamental matrix.
 
-submission.csv is complete from the start: pending pairs have a fallback matrix, and every later version is better.
+submission.csv is complete from the start: pending pairs have a fallback matrix, and later versions have more F.
 If the run is killed, the same command resumes it from its journal in the work directory. Ctrl-C and SIGTERM end
 the run early with a valid file.
 

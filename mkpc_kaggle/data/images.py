@@ -32,19 +32,17 @@ FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "AVIF", "JPEG2000", "PPM")
 # Files that are read as photographs, by suffix; the first three also stand for the competitions'
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 MORE_SUFFIXES = (
-    *(
-        ".jpe",
-        ".jfif",
-        ".webp",
-        ".tif",
-        ".tiff",
-        ".bmp",
-        ".ppm",
-        ".pgm",
-        ".pnm",
-        ".jp2",
-        ".avif",
-    ),
+    ".jpe",
+    ".jfif",
+    ".webp",
+    ".tif",
+    ".tiff",
+    ".bmp",
+    ".ppm",
+    ".pgm",
+    ".pnm",
+    ".jp2",
+    ".avif",
 )
 READ_SUFFIXES = IMAGE_SUFFIXES + MORE_SUFFIXES
 

@@ -52,7 +52,7 @@ class Budget:
     """The time of a run since ``started``, in seconds of ``clock``, which never jumps.
 
     No unit begins after ``stop_units``, and the run stops waiting for workers at ``stop_waiting``.
-    Writing of the final submission starts at ``final_write``. The process ends before ``limit``.
+    The watchdog writes the submission at ``final_write``, if the run has not. The process ends before ``limit``.
     """
 
     started: float
@@ -141,8 +141,7 @@ class Costs:
         """
         if not self.is_known(unit):
             return 0.0
-        count = len(self._measured[unit])
-        margin = max(MIN_MARGIN, MARGIN / sqrt(count))
+        margin = max(MIN_MARGIN, MARGIN / sqrt(len(self._measured[unit])))
         return self.mean(unit) * (1 + margin)
 
     def observe_scene(self, matches: int, seconds: float) -> None:

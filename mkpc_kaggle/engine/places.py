@@ -144,8 +144,7 @@ class Site:
             Place(f"estimates {n}", worker, Kind.ESTIMATE) for n in range(estimators)
         ]
         self.places += [
-            Place("scenes" if n == 0 else f"scenes {n}", self.scene_worker, Kind.SCENE)
-            for n in range(self._cores)
+            Place(f"scenes {n}", self.scene_worker, Kind.SCENE) for n in range(self._cores)
         ]
         self.fallback: list[Place] = []
 

@@ -88,7 +88,7 @@ class Plan:
         """The seconds until no unit may run, so that estimates, scenes and candidates have theirs."""
         state = self.state
         crew = self.crew
-        waiting = int(state.lacks_estimate.sum())
+        waiting = np.count_nonzero(state.lacks_estimate)
         seconds = self.costs.mean(COST_OF_ESTIMATES) * waiting / max(1, crew.estimators)
         if crew.scenes:
             forecasts = self.costs.scenes(state.scene_matches) * state.missing_scenes
@@ -124,7 +124,7 @@ class Plan:
             1, self.crew.matchers
         )
         # A share of the time after the sweep, as it was before the first extra pair
-        had = int(state.done[state.rows :, state.sweep].sum())
+        had = np.count_nonzero(state.done[state.rows :, state.sweep])
         most = CONNECT_SHARE * (self.left / max(seconds, 1e-9) + had)
         return int(min(most, len(state.pairs)))
 
@@ -145,14 +145,11 @@ class Plan:
         phases[costly] = np.maximum(phases[costly], FILL)
         phases[~missing] = NEVER
         for unit, crop in enumerate(state.is_crop.tolist()):
-            if (
-                not self.left
-                or not self.crew.matchers
-                or self.costs.mean(state.units[unit].name) >= self.left
-            ):
+            mean = self.costs.mean(state.units[unit].name)
+            if not self.crew.matchers or mean >= self.left:
                 phases[:, unit] = NEVER
             elif crop:
-                never = missing & (phases == NEVER) & state.before[unit]
+                never = (missing & (phases == NEVER))[:, state.before[unit]]
                 phases[never.any(1), unit] = NEVER
         return phases
 
@@ -267,19 +264,18 @@ class Plan:
             later = busy
         has_scene = state.made[:, 0].astype(bool)
         waits = np.where(has_scene, state.by_batch(later), state.by_batch(held)) > 0
-        is_matching = self.match is not None or bool(busy.any())
+        is_matching = self.phase < NEVER or busy.any()
         due = state.missing_scenes & (state.scene_matches > 0) & ~waits[:, None]
-        ends = self.now + self.costs.scenes(state.scene_matches)
-        in_time = (ends <= self.budget.stop_units) & ~state.stale[:, None] & (not is_matching)
+        in_time = self.now + self.costs.scenes(state.scene_matches) <= self.budget.stop_units
+        in_time &= ~state.stale[:, None] & (not is_matching)
         due[:, 1:] &= in_time[:, 1:]
         for each in state.making:
             due[each] = False
         # Each batch gets its second candidate before any gets a third.
         batches = np.argsort(has_scene, kind="stable")
-        candidates, order = np.nonzero(due[batches].T)
-        found = zip(batches[order].tolist(), candidates.tolist(), strict=True)
+        found = [(int(batches[i]), each) for each, i in np.argwhere(due[batches].T).tolist()]
         most = self.crew.beside if is_matching else self.crew.scenes
-        return list(found)[: max(0, most - len(state.making))]
+        return found[: max(0, most - len(state.making))]
 
 
 def is_complete(state: State, crew: Crew) -> bool:

@@ -40,7 +40,7 @@ class Publication:
         start = self.budget.clock()
         self.save()
         state = self.state
-        about = self.state.request.about
+        about = state.request.about
         about.seconds = start - self.budget.started
         about.failures = list(state.scene_failures.values())
         # The key of each batch's scene, and the reason if it has none

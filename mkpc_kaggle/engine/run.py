@@ -112,7 +112,7 @@ class Run:
             plan = self.plan(now)
             for place in self.site.free(now):
                 self._give(place, plan)
-            if not (plan.match or plan.estimates or plan.scenes or self.site.has_jobs):
+            if not (self.site.has_jobs or plan.match or plan.estimates or plan.scenes):
                 break
             if self.publication.is_due(now):
                 self._publish()
@@ -171,14 +171,12 @@ class Run:
             # Again if a former place has taken these pairs, and for a place that continues elsewhere.
             if place.lost or (plan.match and self.state.busy[plan.match.pairs].min() < NEVER):
                 plan = self.plan(plan.now, len(place.lost))
-            if plan.match is not None and place.is_idle:
+            if plan.match and not place.is_idle:
+                place.start(plan.now)  # after loading, the plan may be another one
+            elif plan.match:
                 done = self.state.done[: self.state.rows]
                 self.progress.count(PHASES[plan.phase], int(done.sum()), done.size, "unit")
                 job = self._match_job(plan.match)
-            elif plan.match is not None:
-                place.start(
-                    plan.now
-                )  # loading takes long, and the plan may be another one then
         if job is not None:
             place.submit(job, plan.now)
 

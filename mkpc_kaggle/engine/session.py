@@ -113,7 +113,8 @@ class Session:
 def first_version(pairs: Sequence[Pair], output: Path, work_dir: Path) -> None:
     """Write fallback rows before using weights, devices or images, which may hang.
 
-    A complete file of an earlier run stays. The work directory gets a copy, since this run may have fewer results.
+    A complete file of an earlier run stays until the loop begins. The work directory gets a copy, since this run
+    may have fewer results.
     Raises :class:`mkpc_kaggle.errors.UserError` if ``output`` cannot be written.
     """
     if output.is_char_device() or output.is_block_device():

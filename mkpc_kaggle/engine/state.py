@@ -16,7 +16,7 @@ from mkpc_kaggle.engine.keys import Images, contents_of, of_candidate
 from mkpc_kaggle.engine.request import Job, MatchJob, PairInputs, Request, SceneJob
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.geometry.crop_need import pays
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, are_models
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, is_fundamental
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.candidates import best_of, candidates_of
 from mkpc_kaggle.scene.densify import batches_of, extra_pairs_of
@@ -70,6 +70,7 @@ class State:
         extra = extra_pairs_of(request.pairs, batches_of(request.pairs), recipe.scene)
         self.pairs: list[Pair] = [*distinct, *extra]
         self.rows = len(distinct)
+        self.is_row = np.arange(len(self.pairs)) < self.rows
         self.units = recipe.units
         self.is_crop = np.array([unit.stage == 2 for unit in self.units], bool)
         # The units of stage 1 before each unit (U, U)
@@ -111,6 +112,9 @@ class State:
         self.batch_of = np.array(
             [self.batches.get(pair.group, -1) for pair in self.pairs], int
         )
+        # The pairs of all batches, one batch after the other, and where each begins
+        self.members = np.hstack([[], *batches.values()]).astype(int)
+        self.starts = self.batch_of[self.members].searchsorted(range(len(batches)))
         self.candidates = candidates_of(self.units, scene)
         size = (len(batches), len(self.candidates))
         self.made = np.full(size, None, object)  # of SceneRecord
@@ -125,17 +129,14 @@ class State:
     @property
     def missing(self) -> Mask:
         """(N, U): today's points are missing, and this run can get them."""
-        return ~self.done & (self.losses[:, :-1] < GIVEN_UP) & ~self.dead
+        missing = ~self.done & (self.losses[:, :-1] < GIVEN_UP)
+        missing[:, self.dead] = False
+        return missing
 
     @property
     def used(self) -> Mask:
         """(N, U): the pair has points of the unit."""
         return self.done & self.needed
-
-    @property
-    def is_row(self) -> Mask:
-        """(N,): a row names the pair."""
-        return np.arange(len(self.pairs)) < self.rows
 
     @property
     def lacks_estimate(self) -> Mask:
@@ -157,9 +158,7 @@ class State:
 
     def by_batch(self, values: NDArray[Any]) -> NDArray[np.int_]:
         """Return the sum of each batch (B,) over its pairs' values (N,)."""
-        # The first bin is of pairs without a batch.
-        sums = np.bincount(self.batch_of + 1, values, minlength=len(self.batches) + 1)
-        return sums[1:].astype(int)
+        return np.add.reduceat(values[self.members], self.starts, dtype=int)
 
     @property
     def scene_matches(self) -> NDArray[np.int_]:
@@ -167,7 +166,7 @@ class State:
         columns = dict(zip(self.titles[:-1], self.matches.T, strict=True))
         every = self.matches.sum(1)
         counts = [self.by_batch(columns.get(name, every)) for name in self.candidates]
-        return np.column_stack(counts)
+        return np.transpose(counts)
 
     @property
     def missing_scenes(self) -> Mask:
@@ -185,11 +184,9 @@ class State:
           lengths of the scene;
         - the fallback.
         """
-        by_scene = (self.scene_source != FALLBACK) & are_models(self.by_scene)
+        by_scene = self.scene_source != FALLBACK
         sources = np.where(by_scene, self.scene_source, np.where(self.has_f, PAIR, FALLBACK))
         matrices = np.where(by_scene[:, None, None], self.by_scene, self.F)
-        # The last gate of the submission: the competition refuses a whole file for one matrix.
-        sources[~are_models(matrices)] = FALLBACK
         matrices[sources == FALLBACK] = FALLBACK_FUNDAMENTAL
         return sources[self.pair_of_row], matrices[self.pair_of_row]
 
@@ -324,7 +321,8 @@ class State:
         self.estimate[index] = key.encode()
         self.estimated[index] = key == self.estimate_key(index)
         self.F[index] = np.reshape(facts["F"], (3, 3))
-        self.has_f[index] = not facts["failure"]
+        # The competition refuses a whole file for one matrix of another rank.
+        self.has_f[index] = not facts["failure"] and is_fundamental(self.F[index])
         self.inliers[index] = sum(facts["inliers"].values())
         self.losses[index, ESTIMATE] = 0
         self._note_change(index)
@@ -337,7 +335,7 @@ class State:
         """
         made = self.made[batch]
         number = self.candidates.index(record.candidate)
-        if number == 0:
+        if not number:
             made[:] = None
             self.stale[batch] = self.scene_inputs(batch)[1] != record.key
         elif self.stale[batch] or record.key != of_candidate(made[0].key, record.candidate):
@@ -352,7 +350,7 @@ class State:
         self.scene_source[members] = FALLBACK  # of the former scene
         for index in members.tolist():
             choice = scene.choices.get(self.contents(index))
-            if choice is not None and choice.F is not None:
+            if choice is not None and choice.F is not None and is_fundamental(choice.F):
                 self.by_scene[index] = choice.F
                 # F at the scene's focal lengths is still the pair's own.
                 self.scene_source[index] = SCENE if choice.from_scene else PAIR

@@ -159,14 +159,12 @@ def _is_model(matrix: Any) -> bool:
     return bool(np.isfinite(matrix).all() and matrix.any())
 
 
-def are_models(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which of the matrices (N, 3, 3) are finite and of rank 2."""
-    finite = np.isfinite(matrices).all((1, 2))
-    known = matrices.copy()
-    known[~finite] = 0
-    first, second, third = np.linalg.svd(known, compute_uv=False).T
-    is_rank_2 = (second > MIN_SECOND * first) & (third < MAX_THIRD * second)
-    return np.asarray(finite & is_rank_2)
+def is_fundamental(matrix: NDArray[np.float64]) -> bool:
+    """Return whether a matrix (3, 3) is finite and of rank 2."""
+    if not np.isfinite(matrix).all():
+        return False
+    first, second, third = np.linalg.svd(matrix, compute_uv=False)
+    return bool(second > MIN_SECOND * first and third < MAX_THIRD * second)
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,7 +248,7 @@ def _find_fundamental(points0: Vectors, points1: Vectors, **settings: Any) -> An
     """Find F: return OpenCV's matrix and mask. A matrix of rank 3, of some sets of wrong matches, is none."""
     found: Any = cv2.findFundamentalMat(points0, points1, **settings)
     matrix, mask = found
-    if _is_model(matrix) and not are_models(matrix[None]).all():
+    if _is_model(matrix) and not is_fundamental(matrix):
         return None, mask
     return matrix, mask
 

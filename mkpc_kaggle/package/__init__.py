@@ -206,7 +206,7 @@ def build_wheel(checkout: Path, directory: Path) -> None:
 
 
 def as_safetensors(found: FoundFile, directory: Path) -> WeightFile:
-    """Write a weight file as safetensors, and return its line of the dataset's manifest.
+    """Write a weight file as safetensors, and return its entry of the dataset's manifest.
 
     Kaggle would unpack a torch checkpoint.
     """

@@ -46,7 +46,7 @@ def shortlist(features: Sequence[Descriptors]) -> list[tuple[int, int]]:
     """Return the sorted, distinct pairs of each image and its ``PARTNERS`` most similar images, by their
     :func:`local_features`, each with the smaller index first.
 
-    An image without features is similar to no other image.
+    An image without features is equally similar to all, and gets the first ones.
     """
     words = _words(features)
     table = np.stack([vlad((found / SCALE).astype(np.float32), words) for found in features])

@@ -3,7 +3,7 @@
 The file of a slot is the one that the user gives for it in Python, with any bytes. Else it is the first
 good one of the names that the manifest has for the slot. Directories are searched in the order ``--weights``,
 ``$MKPC_WEIGHTS``, /kaggle/input, shallow files first. A file with another digest than the manifest's is passed
-over; a file for which the manifest has no digest is used, and a warning says so.
+over; a file for which the manifest has no digest is used.
 """
 
 import os
