@@ -60,11 +60,18 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch
     assert "6 of 6 pairs with an F, 4 of 4 images with a camera" in summary(found)
     assert "F: 5 from cameras, 1 from their own matches" in summary(found)
     # The page has the counts of the terminal.
-    assert "4 of 4 images with a camera" in summary(report)
     assert "4 of 4 images with a camera" in page(found)
     assert "both cameras are known" in page(found)
     (match,) = found.matches(pairs[0].id)
     assert len(match.results[0].matches), "pictures have points"
+
+
+def test_a_scene_s_matrix_of_rank_3_leaves_the_f_of_the_pair(tmp_path, monkeypatch):
+    monkeypatch.setattr("faulty.SCENE_F", np.eye(3))
+    scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
+    pairs = batch_pairs(tmp_path / "images")
+    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert sources(report) == ["pair"] * 6
 
 
 def test_a_focal_length_of_exif_goes_to_the_pairs_the_store_and_the_scene(
