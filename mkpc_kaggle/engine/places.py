@@ -59,8 +59,9 @@ class Place:
         return self.worker is not None and self.is_loaded and self.job is None
 
     def may_start(self, now: float) -> bool:
-        # After losses in a row it waits: scarce memory may become free meanwhile.
-        return self.worker is None and not self.closed and now >= self.since + self.strikes
+        # After two losses in a row it waits a second: scarce memory may become free meanwhile.
+        has_waited = now >= self.since + self.strikes - 1
+        return self.worker is None and not self.closed and has_waited
 
     def start(self, now: float) -> None:
         """Start a worker. Its first answer says whether it is loaded."""

@@ -6,7 +6,6 @@ from math import inf, isfinite
 
 import cv2
 import numpy as np
-from scipy.integrate import trapezoid
 
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 from mkpc_kaggle.geometry.coordinates import Matrix3
@@ -100,6 +99,8 @@ def pose_auc(errors: Sequence[PoseError], threshold: float) -> float:
     It is normalised to 0..1. The curve is piecewise linear through the sorted points (error_i, i /
     n), as in SuperGlue's evaluation. NaN without pairs.
     """
+    from scipy.integrate import trapezoid  # here: SciPy's modules take half a second
+
     if not errors:
         return float("nan")
     angles = np.sort([0.0, *(error.angle for error in errors)])

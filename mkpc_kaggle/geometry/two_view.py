@@ -17,7 +17,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.geometry.coordinates import Matrix3
 
@@ -118,6 +117,8 @@ class TwoView:
 
     def moved(self, step: Vectors) -> "TwoView":
         """Return the views after a step (7,) along the columns of :meth:`tangent`."""
+        from scipy.spatial.transform import Rotation  # here: the import takes half a second
+
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         t = self.t + self._tangent_basis() @ step[3:5]
         t /= np.linalg.norm(t)  # back on the sphere: the scale of t is free

@@ -6,8 +6,6 @@ from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, Rows
@@ -134,6 +132,9 @@ class ViewGraph:
 
     def components(self) -> tuple["ViewGraph", ...]:
         """Return the components connected by strong edges, ordered by first image."""
+        from scipy.sparse import coo_array  # here: SciPy's modules take half a second
+        from scipy.sparse.csgraph import connected_components
+
         # A few wrong matches must not join two scenes.
         strong = self.strong.edges
         firsts = np.array([edge.first for edge in strong], np.intp)
