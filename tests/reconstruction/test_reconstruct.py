@@ -167,7 +167,7 @@ def test_the_table_of_a_run_is_a_table_of_known_cameras(mixed, tmp_path):
     ("name", "more", "units"),
     [
         ("auto", {}, ["1:sift@1536"]),
-        ("classical", {}, ["1:sift@1536", "1:sift@1280", "2:sift@1440"]),
+        ("classical", {}, ["1:sift@1536", "2:sift@1440", "1:sift@1280"]),
         ("auto", {"loma": SiftMatcher(SiftOptions(), "cpu")}, None),
     ],
 )
