@@ -4,7 +4,7 @@
   the number of these processes: for PyTorch and OpenCV (:func:`limit_matching_threads`). There is one for each
   device, unless ``--workers`` has another number.
 - A Ray actor has as many as one process alone on its machine; without GPUs, the CPUs that Ray has there.
-- A process of estimates and features has one thread, in all libraries (:func:`limit_to_one_thread`).
+- A process of estimates has one thread, in all libraries (:func:`limit_to_one_thread`).
 - A process of a scene limits no library. It verifies pairs on all cores. Its mapper has ``threads`` of
   [scene], one by default, and its last adjustment one.
 - A thread of the user's process (``--workers 0``) leaves the limits of the process as they are.
@@ -48,7 +48,7 @@ def limit_to_one_thread() -> None:
     import cv2
     from threadpoolctl import threadpool_limits
 
-    # For libraries that a job may load later: PyTorch, to compare features
+    # For libraries that a job may load later: PyTorch
     os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
     cv2.setNumThreads(1)
     threadpool_limits(1)

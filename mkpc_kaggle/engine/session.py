@@ -1,6 +1,5 @@
 """A run from its pairs: the first version, the parts of the run, and the end at the time limit."""
 
-import hashlib
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,7 +17,7 @@ from mkpc_kaggle.data.outputs import remove_unfinished, replacing
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RaySite
 from mkpc_kaggle.engine.frames import Results
-from mkpc_kaggle.engine.keys import Keys, read_images
+from mkpc_kaggle.engine.keys import Keys, read_images, text_digest
 from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
 from mkpc_kaggle.engine.request import About, Request
 from mkpc_kaggle.engine.run import Run
@@ -77,9 +76,7 @@ class Session:
         """
         over = threading.Event()
         if isfinite(self.budget.time_limit):
-            threading.Thread(
-                target=self._watch, args=(over,), name="watchdog", daemon=True
-            ).start()
+            threading.Thread(target=self._watch, args=[over], daemon=True).start()
         try:
             yield self
         finally:
@@ -100,12 +97,14 @@ class Session:
             with suppress(OSError):
                 remove_unfinished()
 
-        writer = threading.Thread(target=write, name="final write", daemon=True)
+        writer = threading.Thread(target=write, daemon=True)
         writer.start()  # the disk may hang
         writer.join(max(EXIT_S, budget.limit - budget.clock() - EXIT_S))
         # Not exit(): its handlers wait for threads, and one of them hangs.
-        if trouble:
-            logger.error(trouble)
+        if trouble:  # in a thread, since run.log may lie on the disk that hangs
+            line = threading.Thread(target=logger.error, args=[trouble], daemon=True)
+            line.start()
+            line.join(EXIT_S / 2)
         status = self.status or int(bool(trouble))
         leave(128 + self.interrupt.signal if self.interrupt.signal else status, EXIT_S / 4)
 
@@ -128,10 +127,9 @@ def first_version(pairs: Sequence[Pair], output: Path, work_dir: Path) -> None:
             return
     # By content: a run that begins often keeps each version once. A full disk costs the copy, not the run.
     text = output.read_text()
-    name = hashlib.blake2b(text.encode(), digest_size=4).hexdigest()
     with suppress(OSError):
         work_dir.mkdir(parents=True, exist_ok=True)
-        with replacing(work_dir / f"earlier-{name}.csv") as copy:
+        with replacing(work_dir / f"earlier-{text_digest([text])}.csv") as copy:
             copy.write(text)
 
 
