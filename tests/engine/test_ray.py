@@ -73,6 +73,12 @@ def cluster() -> Iterator[Any]:
     patch.undo()
 
 
+# Before a test: its node sets handlers of signals, which a run must not.
+@pytest.fixture(scope="module")
+def lost(cluster):
+    return cluster.add_node(num_cpus=1, object_store_memory=STORE_BYTES)
+
+
 def test_actors_give_the_bytes_of_a_run_in_one_process_though_an_actor_dies(
     cluster, pairs, undisturbed, tmp_path
 ):
@@ -89,9 +95,8 @@ def test_actors_give_the_bytes_of_a_run_in_one_process_though_an_actor_dies(
 
 
 def test_a_machine_lost_during_the_run_costs_its_job_alone(
-    cluster, pairs, undisturbed, tmp_path
+    cluster, lost, pairs, undisturbed, tmp_path
 ):
-    lost = cluster.add_node(num_cpus=1, object_store_memory=STORE_BYTES)
     matcher = DoomedMatcher(node=lost.node_id, mark=tmp_path / "begun")
 
     # Once a job is under way on it: before, the machine would only be missing.
@@ -114,14 +119,19 @@ def test_a_machine_that_lacks_the_weights_or_the_test_set_is_named_when_the_run_
 ):
     missing = tmp_path / "nowhere"
     lacking = [Pair("a", "a", str(missing / "a.png"), str(missing / "b.png"))]
-    told = rf"lacks {missing}: test set and weights must have the same paths"
-    workers = f"ray://{cluster.address}"
     for asked, paths in ((lacking, ()), (pairs, (missing,))):
-        files = {str(path): SimpleNamespace(path=path) for path in paths}
+        files = {str(path): SimpleNamespace(path=path, is_verified=True) for path in paths}
         monkeypatch.setattr(Assembly, "weight_files", files)
-        work_dir = tmp_path / asked[0].id
-        with pytest.raises(UserError, match=told):
-            run(asked, THREE_UNITS, RectifiedMatcher(), work_dir, workers=workers)
+        with pytest.raises(
+            UserError, match=f"lacks {missing}: test set and weights must have"
+        ):
+            run(
+                asked,
+                THREE_UNITS,
+                RectifiedMatcher(),
+                tmp_path / asked[0].id,
+                workers=f"ray://{cluster.address}",
+            )
 
 
 LOCAL = """

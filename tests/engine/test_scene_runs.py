@@ -69,8 +69,7 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch
 def test_a_scene_s_matrix_of_rank_3_leaves_the_f_of_the_pair(tmp_path, monkeypatch):
     monkeypatch.setattr("faulty.SCENE_F", np.eye(3))
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
-    pairs = batch_pairs(tmp_path / "images")
-    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    report = run(batch_pairs(tmp_path / "images"), RECIPE, RectifiedMatcher(), tmp_path)
     assert sources(report) == ["pair"] * 6
 
 
