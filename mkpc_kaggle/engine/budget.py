@@ -117,6 +117,7 @@ class Costs:
     def __init__(self) -> None:
         self._measured: dict[str, deque[float]] = {}
         self._warm_up: dict[str, float] = {}
+        self._means: dict[str, float] = {}
         # Of this run's scenes, without their starts
         self._scene_seconds = 0.0
         self._scene_matches = 0
@@ -126,6 +127,7 @@ class Costs:
             self._warm_up[unit] = seconds
         else:
             self._measured.setdefault(unit, deque(maxlen=WINDOW)).append(seconds)
+        self._means[unit] = fmean(self._measured.get(unit, [seconds]))
 
     def is_known(self, unit: str) -> bool:
         """Return whether a run after the warm-up was measured."""
@@ -133,7 +135,7 @@ class Costs:
 
     def mean(self, unit: str) -> float:
         """Return the expected seconds on a pair; 0 if nothing is known."""
-        return fmean(self._measured.get(unit, [self._warm_up.get(unit, 0.0)]))
+        return self._means.get(unit, 0.0)
 
     def forecast(self, unit: str) -> float:
         """Return the mean plus a margin that shrinks with more measurements; 0 without

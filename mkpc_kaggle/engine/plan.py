@@ -86,18 +86,27 @@ class Plan:
     @cached_property
     def left(self) -> float:
         """The seconds until no unit may run, so that estimates, scenes and candidates have theirs."""
-        state = self.state
         crew = self.crew
-        waiting = np.count_nonzero(state.lacks_estimate)
+        waiting = np.count_nonzero(self.lacks_estimate)
         seconds = self.costs.mean(COST_OF_ESTIMATES) * waiting / max(1, crew.estimators)
         if crew.scenes:
-            forecasts = self.costs.scenes(state.scene_matches) * state.missing_scenes
-            first = forecasts[:, 0]
+            first = self.scene_seconds[:, 0]
             seconds += max(first.max(initial=0.0), first.sum() / crew.scenes)
-            others = float(forecasts[:, 1:].sum()) / crew.scenes
+            others = float(self.scene_seconds[:, 1:].sum()) / crew.scenes
             seconds += min(CANDIDATES_SHARE * self.budget.time_limit, others)
         reserve = min(seconds, RESERVE_SHARE * self.budget.time_limit)
         return max(0.0, self.budget.stop_units - reserve - self.now)
+
+    @cached_property
+    def lacks_estimate(self) -> Mask:
+        return self.state.lacks_estimate
+
+    @cached_property
+    def scene_seconds(self) -> NDArray[np.float64]:
+        """The expected seconds (B, C) of the scenes that are missing and have matches; 0 for others."""
+        matches = self.state.scene_matches
+        is_open = self.state.missing_scenes & (matches > 0)
+        return np.asarray(self.costs.scenes(matches) * is_open)
 
     # Matching
 
@@ -111,8 +120,10 @@ class Plan:
         rows = slice(state.rows)
         forecasts = np.array([self.costs.forecast(unit.name) for unit in state.units])
         # The share of the known pairs that need a unit, and one more that needs it
-        needed = (state.used[rows].sum(0) + 1) / (state.done[rows].sum(0) + 1)
-        seconds = np.cumsum(state.missing[rows].sum(0) * forecasts * needed)
+        used, done, missing = (
+            cells[rows].sum(0, np.int32) for cells in (state.used, state.done, state.missing)
+        )
+        seconds = np.cumsum(missing * forecasts * (used + 1) / (done + 1))
         most = self.left * max(1, self.crew.matchers)
         return int(np.searchsorted(seconds, most, side="right"))
 
@@ -135,15 +146,15 @@ class Plan:
         """
         state = self.state
         missing = state.missing
-        phases = np.full(missing.shape, NEVER, np.int8, order="F")
-        phases[: state.rows, : self.fit] = DEEPEN
-        phases[: state.rows, self.fit :] = FILL
-        phases[: state.rows, state.sweep] = SWEEP
+        phases = np.full_like(missing, FILL, np.int8)
+        phases[:, : self.fit] = DEEPEN
+        phases[:, state.sweep] = SWEEP
+        phases[state.rows :] = NEVER
         phases[state.rows : state.rows + self.extra, state.sweep] = CONNECT
         # A pair that cost two workers may cost two more for each unit, so all others come first.
         costly = (state.losses[:, :-1] == GIVEN_UP).any(1)
         phases[costly] = np.maximum(phases[costly], FILL)
-        phases[~missing] = NEVER
+        phases = np.maximum(phases, np.int8(NEVER) * ~missing)
         for unit, crop in enumerate(state.is_crop.tolist()):
             mean = self.costs.mean(state.units[unit].name)
             if not self.crew.matchers or mean >= self.left:
@@ -240,7 +251,7 @@ class Plan:
         # than the fallback.
         state = self.state
         settled = (self.first >= FILL) & (state.busy == NEVER)
-        due = state.lacks_estimate & ~state.estimating & (settled | ~state.has_f)
+        due = self.lacks_estimate & ~state.estimating & (settled | ~state.has_f)
         return np.asarray(due & bool(self.crew.estimators))
 
     @cached_property
@@ -265,8 +276,8 @@ class Plan:
         has_scene = state.made[:, 0].astype(bool)
         waits = np.where(has_scene, state.by_batch(later), state.by_batch(held)) > 0
         is_matching = self.phase < NEVER or busy.any()
-        due = state.missing_scenes & (state.scene_matches > 0) & ~waits[:, None]
-        in_time = self.now + self.costs.scenes(state.scene_matches) <= self.budget.stop_units
+        due = (self.scene_seconds > 0) & ~waits[:, None]
+        in_time = self.now + self.scene_seconds <= self.budget.stop_units
         in_time &= ~state.stale[:, None] & (not is_matching)
         due[:, 1:] &= in_time[:, 1:]
         for each in state.making:
@@ -277,9 +288,8 @@ class Plan:
         most = self.crew.beside if is_matching else self.crew.scenes
         return found[: max(0, most - len(state.making))]
 
-
-def is_complete(state: State, crew: Crew) -> bool:
-    """Whether all rows have all results that this run can compute, and so do all batches."""
-    is_open = state.missing[: state.rows].any() or state.lacks_estimate.any()
-    has_scenes = crew.scenes and (state.missing_scenes & (state.scene_matches > 0)).any()
-    return not (is_open or has_scenes)
+    @property
+    def is_complete(self) -> bool:
+        """Whether all rows have all results that this run can compute, and so do all batches."""
+        lacks = self.state.missing[: self.state.rows].any() or self.lacks_estimate.any()
+        return not (lacks or (self.crew.scenes and self.scene_seconds.any()))

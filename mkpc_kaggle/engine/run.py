@@ -22,7 +22,7 @@ from mkpc_kaggle.engine.budget import (
 from mkpc_kaggle.engine.frames import Results, results_of
 from mkpc_kaggle.engine.keys import of_candidate
 from mkpc_kaggle.engine.places import Kind, Place, Site
-from mkpc_kaggle.engine.plan import Crew, Plan, is_complete
+from mkpc_kaggle.engine.plan import Crew, Plan
 from mkpc_kaggle.engine.publish import Publication
 from mkpc_kaggle.engine.request import (
     Answer,
@@ -58,7 +58,9 @@ from mkpc_kaggle.setup.console import Progress, logger
 # Pairs of a job of estimates. More would make the last F of a run wait for each other; single pairs, each with a
 # message and a transaction, would cost the loop more.
 MAX_ESTIMATES = 8
-MAX_LOSSES = 3  # of a place in a row, without an answer in between
+# Losses of a place in a row, without an answer in between: in general, and of jobs where no other place can take
+# over, which three bad pairs must not close.
+MAX_LOSSES, MAX_LAST_LOSSES = 3, 10
 
 
 @dataclass(eq=False)
@@ -92,7 +94,6 @@ class Run:
             self.about.ending = self.ending
             self._publish(is_last=True)
         self.about.unsaved = self.store.flush()  # the disk may have room again
-        self.fault(self.about.unsaved)
         # Facts that a full disk kept from the store
         return replace(results_of(self.store), about=self.about)
 
@@ -313,7 +314,8 @@ class Run:
 
         - A lost unit of a pair is tried once more, alone, and then given up in this run.
         - Only a job of pairs that were never lost counts against its place. Three in a row, without an answer in
-          between, close it, and its losses are taken back. After a loss, it continues elsewhere in the order.
+          between, close it, or ten if no other can take over; its losses are taken back. After a loss, it
+          continues elsewhere in the order.
         - A unit that never ran is at fault itself when it was lost in more jobs than there are places. Where a
           place has answered, that does not count against the place.
 
@@ -330,8 +332,10 @@ class Run:
                 self._lose_scene(job, failure)
             else:
                 self._lose_pairs(place, job, failure)
+        is_last = place.is_loaded and not self.site.has_other(place)
+        most = MAX_LAST_LOSSES if is_last else MAX_LOSSES
         # A refusal is an answer of the configuration, which no other worker would change.
-        if place.strikes >= MAX_LOSSES or failure.cause is Cause.REFUSED:
+        if place.strikes >= most or failure.cause is Cause.REFUSED:
             self._close(place, failure)
 
     def _lose_scene(self, job: SceneJob, failure: Failure) -> None:
@@ -350,10 +354,9 @@ class Run:
         if failure.cause is Cause.RAISED:
             place.note_answer()
             return
-        blamed: list[int] = []
-        units = job.units if isinstance(job, MatchJob) else []
-        if is_fresh and not any(self.costs.mean(unit.name) for unit in units):
-            blamed = [state.units.index(unit) for unit in units]
+        units = job.plan.units if isinstance(job, MatchJob) else []
+        has_run = any(self.costs.mean(state.units[unit].name) for unit in units)
+        blamed = units if is_fresh and not has_run else []
         state.unit_losses[blamed] += 1
         place.lost.append((job, blamed))
         if is_fresh:
@@ -367,10 +370,9 @@ class Run:
         state = self.state
         dead = state.unit_losses > max(1, len(self.site.of(Kind.MATCH)))
         for unit in np.flatnonzero(dead & ~state.dead).tolist():
-            text = (
+            self.fault(
                 f"{state.units[unit].name} is skipped on all pairs: it never ran ({failure})"
             )
-            self.fault(text)
         state.dead = dead
 
     def _close(self, place: Place, failure: Failure) -> None:
@@ -389,8 +391,10 @@ class Run:
     def _fall_back(self) -> None:
         """Continue on the fallback places: all matching places are closed, or every unit is skipped."""
         reason = self.site.reason or Ending.NOTHING_RUNS
-        text = f"matching continues on the {self.site.fallback[0].name}: {reason}"
-        self.fault(text, logging.WARNING)
+        self.fault(
+            f"matching continues on the {self.site.fallback[0].name}: {reason}",
+            logging.WARNING,
+        )
         self.site.fall_back()
         # Costs, losses and refusals say nothing about the other device.
         self.costs = Costs()
@@ -419,7 +423,7 @@ class Run:
             return Ending.INTERRUPTED
         if state.dead.all():
             return Ending.NOTHING_RUNS
-        if is_complete(state, self.crew):
+        if self.plan(0).is_complete:
             return Ending.WITH_FAILURES if state.has_failures else Ending.COMPLETE
         if self.site.is_closed or not self.site.of(Kind.ESTIMATE):
             return Ending.NO_WORKER

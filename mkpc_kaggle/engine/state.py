@@ -153,8 +153,7 @@ class State:
     @property
     def sweep(self) -> int:
         """The number of the first unit that can run, of stage 1 if possible."""
-        usable = np.flatnonzero(~self.dead).tolist()
-        return min(usable, key=lambda unit: (self.is_crop[unit], unit), default=0)
+        return int(np.argmin(self.is_crop + 2 * self.dead))
 
     def by_batch(self, values: NDArray[Any]) -> NDArray[np.int_]:
         """Return the sum of each batch (B,) over its pairs' values (N,)."""
@@ -286,18 +285,15 @@ class State:
         for index, key in keys.items():
             if key in estimates:
                 self.use_estimate(index, key, json.loads(estimates[key]))
-        for batch in range(len(self.batches)):
-            self._restore_scenes(store, batch)
-
-    def _restore_scenes(self, store: Store, batch: int) -> None:
-        _, first = self.scene_inputs(batch)
         folder = self.request.scenes_dir
-        keys = [of_candidate(first, name) for name in self.candidates]
-        records = store.facts(keys)
-        for key in keys:
-            # A scene without its folder is made again.
-            if key in records and (folder is None or (folder / key).is_dir()):
-                self.use_scene(batch, SceneRecord.from_json(records[key]))
+        for batch in self.batches.values():
+            _, first = self.scene_inputs(batch)
+            scenes = [of_candidate(first, name) for name in self.candidates]
+            records = store.facts(scenes)
+            for key in scenes:
+                # A scene without its folder is made again.
+                if key in records and (folder is None or (folder / key).is_dir()):
+                    self.use_scene(batch, SceneRecord.from_json(records[key]))
 
     def use_points(
         self, index: int, unit: int, key: str, matches: int, *, is_needed: bool = True
@@ -341,10 +337,10 @@ class State:
         elif self.stale[batch] or record.key != of_candidate(made[0].key, record.candidate):
             return
         made[number] = record
-        finished = {each.candidate: each for each in made if each is not None}
-        best = best_of({name: finished[name].disagreement for name in finished})
+        finished = {each.candidate: each.disagreement for each in made if each is not None}
         # Under today's name: a folder that was renamed keeps its results.
-        scene = self.scenes[list(self.batches)[batch]] = finished[best]
+        scene = made[self.candidates.index(best_of(finished))]
+        self.scenes[list(self.batches)[batch]] = scene
         members = np.flatnonzero(self.batch_of == batch)
         self.dirty[members] = True
         self.scene_source[members] = FALLBACK  # of the former scene
