@@ -1,4 +1,6 @@
-"""Output files of a command: no input is overwritten, and only a complete file replaces another."""
+"""Output files of a command: no input is overwritten, and a submission, a page or a table is replaced only by a
+complete one.
+"""
 
 import os
 import secrets

@@ -313,7 +313,8 @@ class Run:
         Three rules distinguish a bad place, a bad unit and a bad pair:
 
         - A lost unit of a pair is tried once more, alone, and then given up in this run.
-        - Only a job of pairs that were never lost counts against its place. Three in a row, without an answer in
+        - Only a job of pairs that were never lost counts against its place; an estimate only until the place has
+          answered. Three in a row, without an answer in
           between, close it, or ten if no other can take over; its losses are taken back. After a loss, it
           continues elsewhere in the order.
         - A unit that never ran is at fault itself when it was lost in more jobs than there are places. Where a

@@ -2,6 +2,11 @@
 
 Stage 1 matches whole images, MKPC finds the critical region of each image, and stage 2 matches the
 crops.
+
+A matcher gets uint8 pictures: (H, W, 3) RGB as :func:`mkpc_kaggle.data.images.read_image` decodes it, or (H, W)
+gray by OpenCV, as its ``SPEC.colour`` says. :meth:`mkpc_kaggle.recipe.Unit.view` has their size, and
+:meth:`mkpc_kaggle.geometry.coordinates.View.render` cuts, turns, resizes and pads them, with black below and on the
+right. Points come back in pixels of the whole image.
 """
 
 import time
