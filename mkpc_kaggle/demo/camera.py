@@ -83,7 +83,8 @@ def transfer(
     R, t = relative_pose(first, second)
     y, x = np.mgrid[0 : first.height : STEP_PX, 0 : first.width : STEP_PX]
     near = nearness[::STEP_PX, ::STEP_PX].astype(np.float64)
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(first.K).T
+    pixels = np.stack([x, y, np.ones_like(x)], axis=-1)
+    rays = pixels @ np.linalg.inv(first.K).T
     # The point's coordinates times its nearness: a direction for the sky.
     in_second = rays @ R.T + near[..., None] * t
     image = in_second @ second.K.T

@@ -108,5 +108,6 @@ def _span(positions: Floats, size: int) -> slice:
     """Return the whole pixels in 0..size between the least and the greatest position."""
     first = np.floor(positions.min())
     last = np.ceil(positions.max())
-    start, stop = np.clip([first, last + 1], 0, size).astype(int)
+    ends = np.clip([first, last + 1], 0, size)
+    start, stop = ends.astype(int)
     return slice(start, stop)

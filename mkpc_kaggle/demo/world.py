@@ -200,14 +200,15 @@ def paint(
     # From three texels on
     draws = rng.uniform((3 / (largest_m * scale)) ** 2, 1, count)
     lengths = np.sort(3 / np.sqrt(draws))[::-1]
-    sides = np.column_stack([lengths, lengths * rng.uniform(0.3, max_aspect, count)])
+    aspects = rng.uniform(0.3, max_aspect, count)
+    sides = np.column_stack([lengths, lengths * aspects])
     centres = rng.uniform((0, 0), (width, height), (count, 2))
     angles = rng.uniform(0, 180, count)
     # They differ mostly in brightness and a little in hue.
-    shades = (
-        1 + rng.normal(0, contrast, (count, 1)) + rng.normal(0, 0.2 * contrast, (count, 3))
-    )
-    tones = (np.array(colour) * shades).clip(8, 250).tolist()
+    brightness = rng.normal(0, contrast, (count, 1))
+    hue = rng.normal(0, 0.2 * contrast, (count, 3))
+    shades = np.array(colour) * (1 + brightness + hue)
+    tones = shades.clip(8, 250).tolist()
     for centre, side, angle, tone in zip(centres, sides, angles, tones, strict=True):
         if leaves is STONE:
             low = (centre - side / 2).astype(int)

@@ -116,7 +116,8 @@ def _developed(image: FloatImage, rng: np.random.Generator) -> Pixels:
     gain = rng.uniform(0.75, 1.25)
     gamma = rng.uniform(0.85, 1.2)
     # Of blue, green and red
-    factors = (rng.uniform(0.93, 1.07, 3) * gain / 255).astype(np.float32)
+    tint = rng.uniform(0.93, 1.07, 3)
+    factors = (tint * gain / 255).astype(np.float32)
     light = np.clip(image * factors, 0, 1) ** gamma
     # The lens first, then the sensor: noise is not blurred.
     blurred = cv2.GaussianBlur(light, (5, 5), rng.uniform(0.3, 0.7))
@@ -130,7 +131,8 @@ def _selected(pairs: Sequence[DemoPair]) -> list[DemoPair]:
     """Select the test pairs among scored pairs, spread evenly over the ranks of covisibility."""
     scored = [pair for pair in pairs if pair.covisibility >= MIN_COVISIBILITY]
     scored.sort(key=lambda pair: pair.covisibility)
-    ranks = np.linspace(0, len(scored) - 1, min(TEST_PAIRS, len(scored)))
+    count = min(TEST_PAIRS, len(scored))
+    ranks = np.linspace(0, len(scored) - 1, count)
     return [scored[rank] for rank in ranks.round().astype(int)]
 
 
@@ -166,7 +168,8 @@ def _write_test(
     # Ids of batches and images are digests: like the competition's, they say nothing of the order.
     batch = _digest(f"0/{scene}")[:8]
     hidden = {}
-    for each in {each.name: each for pair in pairs for each in pair[:2]}.values():
+    shown = {each.name: each for pair in pairs for each in pair[:2]}
+    for each in shown.values():
         hidden[each.name] = _digest(f"0/{scene}/{each.name}")[:32]
         path = directory / "test_images" / batch / f"{hidden[each.name]}.png"
         _write_image(path, each.picture)
@@ -190,7 +193,8 @@ def _write_image(path: Path, picture: Pixels) -> None:
 def _write_rows(path: Path, header: str, rows: Iterable[str]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     # The same bytes on every system.
-    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8", newline="\n")
+    lines = "\n".join([header, *rows])
+    path.write_text(lines + "\n", encoding="utf-8", newline="\n")
 
 
 def _numbers(values: Floats) -> str:

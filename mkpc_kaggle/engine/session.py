@@ -1,8 +1,8 @@
 """A run from its pairs: the first version, the parts of the run, and the end at the time limit.
 
-A run ends in time by four deadlines of :class:`mkpc_kaggle.engine.budget.Budget`. The plan begins no unit after the
-first, the loop stops waiting at the second, the watchdog here writes the submission at the third if the loop hangs,
-and the process ends before the limit.
+A run ends in time by four deadlines of :class:`mkpc_kaggle.engine.budget.Budget`. The plan begins no unit after
+the first, the loop stops waiting at the second, the watchdog here writes the submission at the third if the loop
+hangs, and the process ends before the limit.
 """
 
 import threading
