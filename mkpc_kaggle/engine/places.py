@@ -48,7 +48,7 @@ class Place:
     worker: ThreadWorker | None = None
     job: Job | None = None
     is_loaded: bool = False
-    has_answered: bool = False  # to any job
+    answers: int = 0  # to jobs
     strikes: int = 0
     lost: list[tuple[Job, list[int]]] = field(default_factory=list)
     closed: str = ""
@@ -103,7 +103,7 @@ class Place:
 
     def note_answer(self) -> None:
         """Note that the worker works: it answered a job, if only by an ordinary error."""
-        self.has_answered = True
+        self.answers += 1
         self.strikes = 0
         self.lost = []
 

@@ -58,9 +58,10 @@ from mkpc_kaggle.setup.console import Progress, logger
 # Pairs of a job of estimates. More would make the last F of a run wait for each other; single pairs, each with a
 # message and a transaction, would cost the loop more.
 MAX_ESTIMATES = 8
-# Losses of a place in a row, without an answer in between: in general, and of jobs where no other place can take
-# over, which three bad pairs must not close.
-MAX_LOSSES, MAX_LAST_LOSSES = 3, 10
+# Losses of a place in a row, without an answer in between, of a new and of a proven place: of 10,000 pairs with
+# 5 % bad ones, three in a row are common, and five are not.
+MAX_LOSSES, MAX_PROVEN_LOSSES = 3, 5
+PROVEN = 20  # answers of a proven place
 
 
 @dataclass(eq=False)
@@ -314,9 +315,8 @@ class Run:
 
         - A lost unit of a pair is tried once more, alone, and then given up in this run.
         - Only a job of pairs that were never lost counts against its place; an estimate only until the place has
-          answered. Three in a row, without an answer in
-          between, close it, or ten if no other can take over; its losses are taken back. After a loss, it
-          continues elsewhere in the order.
+          answered. Three in a row, without an answer in between, close it, and its losses are taken back; five
+          after twenty answers, or if no other can take over. After a loss, it continues elsewhere in the order.
         - A unit that never ran is at fault itself when it was lost in more jobs than there are places. Where a
           place has answered, that does not count against the place.
 
@@ -333,8 +333,8 @@ class Run:
                 self._lose_scene(job, failure)
             else:
                 self._lose_pairs(place, job, failure)
-        is_last = place.is_loaded and not self.site.has_other(place)
-        most = MAX_LAST_LOSSES if is_last else MAX_LOSSES
+        is_proven = place.answers >= PROVEN or not self.site.has_other(place)
+        most = MAX_PROVEN_LOSSES if is_proven else MAX_LOSSES
         # A refusal is an answer of the configuration, which no other worker would change.
         if place.strikes >= most or failure.cause is Cause.REFUSED:
             self._close(place, failure)
@@ -362,8 +362,8 @@ class Run:
         place.lost.append((job, blamed))
         if is_fresh:
             self._skip_units(failure)
-            place.strikes += not place.has_answered or (bool(units) and not blamed)
-        elif units and not place.has_answered and self.site.has_other(place):
+            place.strikes += not place.answers or (bool(units) and not blamed)
+        elif units and not place.answers and self.site.has_other(place):
             place.strikes = MAX_LOSSES
 
     def _skip_units(self, failure: Failure) -> None:
