@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Matrix3
 
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
+MAX_LINE = 1 << 24  # characters that are read at once: a line without an end is refused
 
 # Characters that end lines or control a terminal.
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
@@ -278,7 +279,8 @@ def read_rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, list[st
             TextIOWrapper(file, encoding="utf-8-sig", newline="") as stream,
         ):
             # ``strict``: a quoted cell without an end is an error, and not the rest of the file.
-            table = csv.DictReader(stream, strict=True)
+            lines = iter(partial(stream.readline, MAX_LINE), "")
+            table = csv.DictReader(lines, strict=True)
             header = table.fieldnames or ()
             if missing := [column for column in columns if column not in header]:
                 found = ", ".join(header)[:200] or "none"
