@@ -27,7 +27,7 @@ MAX_SILENCE_S, MIN_SILENCE_S, SILENCE_SHARE = 60.0, 5.0, 0.02
 # Number of the latest measurements in the mean: costs drift when a GPU heats up or a disk is shared.
 WINDOW = 64
 # Margin of a forecast from one measurement, sqrt(n) times smaller from n measurements.
-MARGIN, MIN_MARGIN = 0.4, 0.01
+MARGIN = 0.4
 SCENE_START_S = 3.0  # start-up time of a scene's process
 # Per match of a reconstruction: the initial forecast, and a lower bound for the limit of a hang.
 SCENE_MATCH_S = 5e-4
@@ -143,7 +143,7 @@ class Costs:
         """
         if not self.is_known(unit):
             return 0.0
-        margin = max(MIN_MARGIN, MARGIN / sqrt(len(self._measured[unit])))
+        margin = MARGIN / sqrt(len(self._measured[unit]))
         return self.mean(unit) * (1 + margin)
 
     def observe_scene(self, matches: int, seconds: float) -> None:

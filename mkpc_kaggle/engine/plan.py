@@ -3,8 +3,9 @@
 A :class:`Plan` has no queue and no memory. The first unit runs on all pairs (sweep), then on extra pairs
 (connect), then the units that fit for all pairs (deepen), then the others, weakest pairs first (fill).
 
-A unit no longer fits in time by two rules. The time left ends before the estimates, scenes and candidates that are
-still due, for which up to a fifth of the limit is reserved.
+A unit no longer fits in time by two rules. The time left ends at ``stop_units`` (the limit less 0.5 % of it, 1.5
+to 60 s, and six forecasts of a write), less up to a fifth of the limit for the estimates, scenes and candidates
+that are still due.
 
 - The prefix that fits: a unit whose forecast, with those of the units before it, for all missing pairs exceeds the
   time left of all workers waits for the last phase, unless it is the unit of the sweep. A unit of stage 2 counts
@@ -12,7 +13,7 @@ still due, for which up to a fifth of the limit is reserved.
 - By its mean, one more pair would not end in time: the unit does not begin, in any phase, nor does a crop that
   depends on it. Near the end, a minibatch is made smaller first.
 
-A forecast is the mean of the latest runs and a margin, 40 % after one and 1 % after many. It is 0 for a unit that
+A forecast is the mean of the latest runs and a margin, 40 % after one and 5 % after many. It is 0 for a unit that
 has had no run but its warm-up; the mean is that of the warm-up then. A worker applies the second rule again before
 each minibatch, by its own clock (:class:`mkpc_kaggle.engine.worker.MatchRunner`).
 """

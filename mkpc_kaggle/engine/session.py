@@ -2,7 +2,8 @@
 
 A run ends in time by four deadlines of :class:`mkpc_kaggle.engine.budget.Budget`. The plan begins no unit after
 the first, the loop stops waiting at the second, the watchdog here writes the submission at the third if the loop
-hangs, and the process ends before the limit.
+hangs, and :func:`mkpc_kaggle.setup.console.leave` kills the children and ends the process before the limit,
+without waiting for a thread.
 """
 
 import threading

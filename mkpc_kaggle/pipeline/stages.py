@@ -5,8 +5,9 @@ crops.
 
 A matcher gets uint8 pictures: (H, W, 3) RGB as :func:`mkpc_kaggle.data.images.read_image` decodes it, or (H, W)
 gray by OpenCV, as its ``SPEC.colour`` says. :meth:`mkpc_kaggle.recipe.Unit.view` has their size, and
-:meth:`mkpc_kaggle.geometry.coordinates.View.render` cuts, turns, resizes and pads them, with black below and on
-the right. Points come back in pixels of the whole image.
+:meth:`mkpc_kaggle.geometry.coordinates.View.render` cuts them, turns them as EXIF says (mirrored ones stay so),
+resizes them, and pads them with black below and on the right to ``SPEC.multiple``. Points come back in pixels of
+the whole image.
 """
 
 import time

@@ -66,7 +66,7 @@ SWEEP_SHARE = 0.7  # of the limit, within which the sweep is said to fit
 MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {
     "reserve for scenes": ((plan, "RESERVE_SHARE", 0.0),),
     "margin of scenes": ((budget, "SCENE_MARGIN", 1.0),),
-    "margin of units": ((budget, "MARGIN", 0.0), (budget, "MIN_MARGIN", 0.0)),
+    "margin of units": ((budget, "MARGIN", 0.0),),
     "latest costs": ((budget, "WINDOW", 10**9),),
     "short jobs": ((plan, "JOB_SHARE", math.inf),),
     "connect share": ((plan, "CONNECT_SHARE", 1.0),),
