@@ -4,6 +4,7 @@ import re
 import sys
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from select import select
 from typing import TextIO, TypeVar
 
 from mkpc_kaggle.errors import UserError
@@ -56,6 +57,9 @@ def print_to(stream: TextIO | None, text: str, end: str = "\n") -> None:
     """Print a text if that is possible; ``None`` is no stream."""
     with suppress(OSError, ValueError):  # lost terminal, full disk, or closed stream
         if stream is not None:
+            # A blocked print holds the stream's lock, for which the start of any process waits.
+            with suppress(OSError, ValueError, TypeError):
+                select([], [stream], [])
             print(text, file=stream, flush=True, end=end)
 
 
