@@ -15,7 +15,7 @@ from mkpc_kaggle.errors import UserError
 # and cuDNN 9; PyTorch's search for a convolution that fits into the free memory, in its current
 # wording and in that until 1.13.
 _OUT_OF_MEMORY = re.compile(
-    "MemoryError|OutOfMemory|out of memory|can't allocate memory|Insufficient memory|Failed to allocate"
+    r"^\w*MemoryError|OutOfMemory|out of memory|can't allocate memory|Insufficient memory|Failed to allocate"
     "|_STATUS_ALLOC_FAILED|ALLOCATION_FAILED|unable to find an engine|Unable to find a valid cuDNN algorithm"
 )
 # PyTorch prefixes errors of the CUDA runtime and of cuBLAS with "CUDA error: ".
