@@ -60,7 +60,7 @@ class Place:
 
     def may_start(self, now: float) -> bool:
         # After two losses in a row it waits a second: scarce memory may become free meanwhile.
-        has_waited = now >= self.since + self.strikes - 1
+        has_waited = now >= self.since + (self.strikes > 1)
         return self.worker is None and not self.closed and has_waited
 
     def start(self, now: float) -> None:

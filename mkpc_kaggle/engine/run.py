@@ -333,7 +333,8 @@ class Run:
                 self._lose_scene(job, failure)
             else:
                 self._lose_pairs(place, job, failure)
-        is_proven = place.answers >= PROVEN or not self.site.has_other(place)
+        is_last = place.is_loaded and not self.site.has_other(place)
+        is_proven = place.answers >= PROVEN or is_last
         most = MAX_PROVEN_LOSSES if is_proven else MAX_LOSSES
         # A refusal is an answer of the configuration, which no other worker would change.
         if place.strikes >= most or failure.cause is Cause.REFUSED:

@@ -310,7 +310,7 @@ class SimulatedSite(Site):
 
     def wait(self, until: float) -> None:
         now = self.clock.now
-        pauses = [place.since + place.strikes for place in self.places if not place.worker]
+        pauses = [place.since + 1 for place in self.places if not place.worker]
         later = [pause for pause in pauses if pause > now]
         moment = min([until, *later, *(worker.ready for worker in self.workers)])
         # Hung jobs end by their own limits.
