@@ -78,8 +78,7 @@ def same_file(path: Path, other: Path) -> bool:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[TextIO]:
-    """Open a temporary file, which replaces ``path`` once the new file is complete and on disk, as each version of
-    ``submission.csv`` does.
+    """Open a temporary file. It replaces ``path`` once it is complete and on disk.
 
     The temporary file lies next to ``path``; files that a killed process left there are removed.
     Raises ``OSError`` and removes the temporary file if writing fails.

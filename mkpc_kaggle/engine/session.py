@@ -1,9 +1,9 @@
 """A run from its pairs: the first version, the parts of the run, and the end at the time limit.
 
 A run ends in time by four deadlines of :class:`mkpc_kaggle.engine.budget.Budget`. The plan begins no unit after
-the first, the loop stops waiting at the second, the watchdog here writes the submission at the third if the loop
-hangs, and :func:`mkpc_kaggle.setup.console.leave` kills the children and ends the process before the limit,
-without waiting for a thread.
+the first, and the loop stops waiting at the second. The watchdog here writes the submission at the third if the
+loop hangs. Then :func:`mkpc_kaggle.setup.console.leave` kills the children and ends the process before the
+limit, without waiting for a thread.
 """
 
 import threading
