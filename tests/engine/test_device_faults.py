@@ -234,7 +234,6 @@ def test_a_minibatch_too_large_for_the_memory_is_halved_once_and_no_worker_is_lo
             "8 of 8 pairs got no F because of errors; the most frequent (8): KeyError: 'image 7'",
         ),
         (break_device, "no worker left, the faults say why; the same command resumes"),
-        (exhaust_gpu, "no worker left, the faults say why; the same command resumes"),
     ],
 )
 def test_a_run_that_failed_has_exit_status_one_and_a_line(

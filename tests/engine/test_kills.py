@@ -21,7 +21,7 @@ def written(report: Results) -> list[Any]:
     return [matrices(report), matrices_of(report.pairs).tolist(), sources(report)]
 
 
-@pytest.mark.parametrize("rounds", [2, pytest.param(15, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("rounds", [1, pytest.param(15, marks=pytest.mark.slow)])
 def test_a_run_whose_workers_are_killed_at_random_moments_ends_as_the_undisturbed_one(
     tmp_path, monkeypatch, rounds
 ):
@@ -57,4 +57,4 @@ def test_a_run_whose_workers_are_killed_at_random_moments_ends_as_the_undisturbe
         assert written(report) == written(undisturbed)
         faults += report.about.faults
     assert faults
-    assert all("the worker died" in fault for fault in faults)
+    assert all("the worker died: signal SIGKILL" in fault for fault in faults)
