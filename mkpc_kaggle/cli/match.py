@@ -34,8 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    inputs = [arguments.image0, arguments.image1, options.recipe_file(arguments)]
-    require_apart({"--out": arguments.out}, filter(None, inputs), weights=arguments.weights)
+    inputs = [arguments.image0, arguments.image1, *options.recipe_files(arguments.recipe)]
+    require_apart({"--out": arguments.out}, inputs, weights=arguments.weights)
     # Before the work: a wrong suffix should not cost minutes of matching.
     if arguments.out is not None:
         require_format(arguments.out)

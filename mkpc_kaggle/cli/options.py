@@ -55,11 +55,10 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
     add("--set", action="append", default=[], metavar="TABLE.KEY=VALUE", help=text)
 
 
-def recipe_file(arguments: argparse.Namespace) -> Path | None:
-    """Return the file of the recipe, which no output may replace; ``None`` for a recipe's name."""
-    name, _ = split_mode(arguments.recipe)
+def recipe_files(*recipes: str) -> list[Path]:
+    """Return the files of recipes, which no output may replace; a recipe's name has none."""
     # A folder may have the name of a recipe.
-    return Path(name) if name.endswith(".toml") else None
+    return [Path(name) for name, _ in map(split_mode, recipes) if name.endswith(".toml")]
 
 
 def add_weights(parser: argparse.ArgumentParser) -> None:
@@ -144,18 +143,14 @@ def settings_of(arguments: argparse.Namespace) -> dict[str, Any]:
     return dict(map(parse_setting, arguments.set))
 
 
-def assembly_of(
-    arguments: argparse.Namespace, interrupt: Interrupt, recipe: str = ""
-) -> Assembly:
-    """Return the assembly of a recipe, by default the command's, with the command's options."""
-    name, mode = split_mode(recipe or arguments.recipe)
+def assembly_of(arguments: argparse.Namespace, interrupt: Interrupt, recipe: str) -> Assembly:
+    """Return the assembly of a recipe with the command's options."""
     with interrupt.raising():  # computing the digests of large files takes long
         return assemble(
-            name,
+            recipe,
             weights=arguments.weights,
             device=arguments.device,
             precision=arguments.precision,
-            mode=mode,
             scenes=arguments.reconstruct,
             settings=settings_of(arguments),
         )
@@ -194,10 +189,9 @@ def watched_session(
 
     Its watchdog ends the program in time even if the run hangs.
     """
-    opened = Session(
+    with Session(
         work_dir, budget_of(arguments), interrupt, arguments.fresh, workers=arguments.workers
-    )
-    with opened.watched() as session:
+    ).watched() as session:
         yield session
         drain()  # while the watchdog is active: the reader of the output may hang
 

@@ -28,7 +28,7 @@ OUT gets:
 
 OUT must be empty, or of an earlier run of this command: the names above are replaced. Points refer to the pixels
 of the stored file, as COLMAP reads it, without the EXIF orientation. If photographs are added, the models keep
-the coordinates of the former models/0.
+the coordinates of models/0 of the last complete run.
 
 All pairs of up to 200 photographs are matched. Of more, each is matched with the 20 most similar.
 Without weights, recipe auto runs one unit of RootSIFT here, and enlarges no image: three units cost three times

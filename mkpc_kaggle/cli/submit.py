@@ -20,8 +20,8 @@ If the run is killed, the same command resumes it from its journal in the work d
 the run early with a valid file.
 
 Exit status: 0 done, or the time limit was reached; 1 the run failed (no worker remained, or errors left most pairs
-without an F), or the last version of the file could not be written; an earlier version is complete; 2 bad input;
-130 or 143 ended by a signal; the file is complete.
+without an F), or the last version of the file, or of the journal, could not be written; an earlier version is
+complete; 2 bad input; 130 or 143 ended by a signal; the file is complete.
 """
 
 
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     options.add_matching(parser)
     text = """reconstruct the pairs of a batch together and take F from the cameras (default: the recipe's choice;
-        the paper's recipes do not). A pair's F then also depends on other pairs: read your competition's rules,
+        imc2022 does not). A pair's F then also depends on other pairs: read your competition's rules,
         and compare published stereo scores with --no-scenes only"""
     add("--scenes", dest="reconstruct", action=argparse.BooleanOptionalAction, help=text)
     options.add_run(parser, time_limit="8h45m")
@@ -62,15 +62,15 @@ def run(arguments: argparse.Namespace) -> int:
     work_dir: Path = arguments.work_dir or output.parent / f"{output.stem}.work"
     page = None if arguments.no_report else output.parent / f"{output.stem}.html"
     files = {"--output": output, "the report": page}
-    inputs = [*test_side(arguments.test_dir), options.recipe_file(arguments)]
-    require_apart(files, filter(None, inputs), work_dir, arguments.weights)
+    inputs = [*test_side(arguments.test_dir), *options.recipe_files(arguments.recipe)]
+    require_apart(files, inputs, work_dir, arguments.weights)
     with interruptible() as interrupt:
         pairs = read_test_side(arguments.test_dir)
         # The first version precedes the watchdog: a run that starts after its limit must leave a
         # complete file.
         first_version(pairs, output, work_dir)
         with options.watched_session(arguments, work_dir, interrupt) as session:
-            assembly = options.assembly_of(arguments, interrupt)
+            assembly = options.assembly_of(arguments, interrupt, arguments.recipe)
             about = f"{plural(len(pairs), 'pair')}, recipe {assembly.recipe.name}, {assembly.placement}"
             lines = [
                 f"{about}, journal in {work_dir}",

@@ -58,7 +58,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.compare and len(recipes) < 2:
         raise UserError("--compare needs two recipes or more")
     # Before any work: a run of hours must not end in an output that cannot be written.
-    require_apart({"--json": arguments.json}, [arguments.train_dir], arguments.work_dir)
+    inputs = [arguments.train_dir, *options.recipe_files(*recipes)]
+    require_apart({"--json": arguments.json}, inputs, arguments.work_dir, arguments.weights)
     scenes = options.train_side_of(arguments)
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     if line := missing_line(pairs):
@@ -77,6 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
         assemblies = [options.assembly_of(arguments, interrupt, text) for text in recipes]
         # They share a journal, so that common units run once.
         for assembly in assemblies:
+            session.status = 1  # until the scores are printed
             validation = _run_recipe(arguments, scenes, assembly, session)
             runs.append(validation)
             page = None if arguments.work_dir is None else work_dir / "report.html"

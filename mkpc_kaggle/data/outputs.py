@@ -15,7 +15,6 @@ from mkpc_kaggle.errors import UserError
 
 # Suffix of each option's results. In an input directory, a file with it is an earlier result.
 SUFFIXES = {"--output": ".csv", "--json": ".json", "the report": ".html"}
-UNFINISHED: set[Path] = set()  # temporary files of this process
 PROBE_BYTES = 1 << 20  # more than the buffer of a stream that pycolmap writes
 
 
@@ -87,7 +86,6 @@ def replacing(path: Path) -> Iterator[TextIO]:
         with suppress(OSError):
             left.unlink()
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-    UNFINISHED.add(part)
     try:
         with part.open("x", encoding="utf-8", newline="") as stream:  # "x" follows no link
             yield stream
@@ -97,7 +95,6 @@ def replacing(path: Path) -> Iterator[TextIO]:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
-        UNFINISHED.discard(part)
 
 
 def sync(folder: Path) -> None:
@@ -114,9 +111,3 @@ def sync(folder: Path) -> None:
         probe.write(bytes(PROBE_BYTES))
         probe.flush()
         os.fsync(probe.fileno())
-
-
-def remove_unfinished() -> None:
-    """Remove the incomplete temporary files of :func:`replacing` before the process ends."""
-    for part in tuple(UNFINISHED):
-        part.unlink(missing_ok=True)

@@ -124,7 +124,7 @@ def results(directory: Path | str) -> Results:
     Parameters
     ----------
     directory : str or Path
-        NAME.work of a submission, ``--work-dir``, or ``work_dir`` of :func:`reconstruct`.
+        NAME.work of a submission, ``--work-dir``, or OUT/work of :func:`reconstruct`.
 
     Returns
     -------

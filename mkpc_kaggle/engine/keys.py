@@ -13,7 +13,6 @@ import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, field, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.scene.view_graph import BatchImage
-from mkpc_kaggle.setup.assembly import Assembly
+from mkpc_kaggle.setup.assembly import Assembly, version_of_package
 from mkpc_kaggle.setup.console import Progress
 
 # Versions of the algorithms, each in the digests of its kind. With a wrong version, old results would
@@ -90,7 +89,16 @@ class Keys:
             tuple(units),
             digest({name: value for name, value in mkpc.items() if name not in RULE}),
             estimate,
-            digest([SCENE_VERSION, scene, cameras, tracks, estimate, _mapper_version()]),
+            digest(
+                [
+                    SCENE_VERSION,
+                    scene,
+                    cameras,
+                    tracks,
+                    estimate,
+                    version_of_package("pycolmap"),
+                ]
+            ),
             assembly.masks,
         )
 
@@ -120,14 +128,6 @@ class Keys:
         """
         # The key includes names: images with equal contents are one image of a scene, with one name.
         return digest([self.scene, inputs])
-
-
-def _mapper_version() -> str:
-    """Return the version of pycolmap; empty without it: pairs need none."""
-    try:
-        return version("pycolmap")
-    except PackageNotFoundError:
-        return ""
 
 
 def of_candidate(scene: str, candidate: str) -> str:

@@ -195,6 +195,7 @@ class Plan:
         seconds = list(map(costs.mean, names))
         if self.lost or state.is_suspect[pairs[0]]:
             units = units[:1]
+            order = pairs  # no image is decoded ahead, which could be another cause
         else:
             # Near the end, a smaller minibatch still ends in time.
             size = max(1, int(min(self.crew.minibatch, self.left / max(seconds[0], 1e-9))))

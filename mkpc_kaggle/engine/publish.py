@@ -59,7 +59,7 @@ class Publication:
     def save(self) -> str:
         """Write the results unless the run has ended. Return why that failed, or an empty text."""
         about = self.state.request.about
-        # The loop and the watchdog would write the same temporary file.
+        # The loop and the watchdog would remove each other's temporary file.
         with self.lock:
             if not self.has_ended:
                 try:

@@ -52,7 +52,6 @@ class About:
     # The table of a recipe's file, and the recipe's name
     recipe: dict[str, Any] = field(default_factory=dict)
     device: str = ""
-    limit: float | None = None  # in seconds; None: no limit
     left_out: Sequence[str] = ()  # matchers that did not run, by cause
     # Of the package and its main dependencies
     versions: dict[str, str] = field(default_factory=dict)
@@ -96,7 +95,7 @@ class Request:
 class PairInputs:
     """Inputs of a job on a pair: its images, and the keys of its points by unit, in the recipe's order.
 
-    For a scene, ``own`` is the F of the pair.
+    ``own`` is the F of its own matches, for a scene.
     """
 
     index: int

@@ -14,12 +14,13 @@ from dataclasses import dataclass
 from functools import partial
 from math import isfinite
 from pathlib import Path
+from shutil import rmtree
 from tempfile import TemporaryFile
 from types import MappingProxyType
 from typing import Self
 
 from mkpc_kaggle.data.competition import Pair, names_of, submission_problem, write_submission
-from mkpc_kaggle.data.outputs import remove_unfinished, replacing
+from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RaySite
 from mkpc_kaggle.engine.frames import Results
@@ -99,9 +100,6 @@ class Session:
         def write() -> None:
             nonlocal trouble
             trouble = self.save()
-            # A report that is cut off would lie next to the submission.
-            with suppress(OSError):
-                remove_unfinished()
 
         writer = threading.Thread(target=write, daemon=True)
         writer.start()  # the disk may hang
@@ -182,7 +180,6 @@ def run_pairs(
     about = About(
         {**assembly.recipe.table(), "name": assembly.recipe.name},
         str(assembly.placement),
-        budget.time_limit if isfinite(budget.time_limit) else None,
         assembly.left_out,
         assembly.versions,
         dict(files),
@@ -192,6 +189,8 @@ def run_pairs(
         pairs, assembly.recipe, keys, root, assembly.cameras, scenes_dir, about, publish
     )
     with Store.open(work_dir, fresh=session.fresh) as store:
+        if session.fresh and scenes_dir is not None:
+            rmtree(scenes_dir, ignore_errors=True)
         # The workers' log is that of this run.
         with suppress(OSError):
             (work_dir / WORKERS_LOG).unlink(missing_ok=True)

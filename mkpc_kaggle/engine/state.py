@@ -57,7 +57,7 @@ class State:
 
     Of a unit (U,): ``unit_losses``, lost jobs of a unit that never ran; ``dead``, no worker runs it.
 
-    Of the B batches and C candidates of their scenes: ``made`` (B, C), the finished ones from today's results;
+    Of the B batches and C candidates of their scenes: ``made`` (B, C), the latest finished ones;
     ``scenes``, the one in use by batch (``best_of``); ``scene_losses`` (B, C); ``stale`` (B,),
     the scene is not today's; ``making``, (batch, candidate) under way. ``batch_of`` (N,) is -1 without a batch.
     """

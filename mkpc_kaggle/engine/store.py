@@ -17,7 +17,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Self
 
-from mkpc_kaggle.errors import UserError, printable, writing
+from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.critical_region import regions_json
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
@@ -78,7 +78,7 @@ def points_row(key: str, result: UnitResult) -> tuple[Any, ...]:
 class Store:
     """The store of a work directory. :meth:`open` gives one to write, :meth:`read` a snapshot.
 
-    ``path`` is the file, or ``None`` if all is in memory. ``trouble`` is a sentence on what keeps the file
+    ``path`` is the file, or ``None`` if it cannot be written. ``trouble`` is a sentence on what keeps the file
     from having all results, if anything: some are in the database ``spare``, in memory, and are written at
     ``retry_at`` on the monotonic clock. ``lock`` is that of a store to write.
     """
@@ -120,7 +120,7 @@ class Store:
                 trouble = error
         # The results of earlier runs, if any
         try:
-            store = cls(directory, checked(path, IMMUTABLE), path)
+            store = cls(directory, checked(path, IMMUTABLE))
         except (sqlite3.OperationalError, UserError):
             store = cls(directory, connected(":memory:"))
             create(store.db)
@@ -208,8 +208,7 @@ class Store:
         """Return these columns of the rows with these keys, if they exist. Raise :class:`UserError` if the file
         cannot be read.
         """
-        # Names of files may have letters that UTF-8 does not have.
-        texts = json.dumps([printable(key) for key in keys])
+        texts = json.dumps(list(keys))
         query = f"SELECT {columns} FROM {table} WHERE key IN (SELECT value FROM json_each(?))"
         with undamaged(self.directory / FILE_NAME):
             return self.db.execute(query, [texts]).fetchall()
@@ -252,7 +251,10 @@ def connected(path: Path | str, options: str = "") -> sqlite3.Connection:
     ``path`` is a file, or ":memory:". ``options`` belong to the file's SQLite URI.
     """
     uri = f"{path.resolve().as_uri()}?{options}" if isinstance(path, Path) else f"file:{path}"
-    return sqlite3.connect(uri, uri=True, timeout=TIMEOUT_S, isolation_level=None)
+    db = sqlite3.connect(uri, uri=True, timeout=TIMEOUT_S, isolation_level=None)
+    # Sorting must not need a disk, which may be full.
+    db.execute("PRAGMA temp_store = MEMORY")
+    return db
 
 
 def checked(path: Path, options: str) -> sqlite3.Connection:
@@ -279,7 +281,7 @@ def checked(path: Path, options: str) -> sqlite3.Connection:
                 f"{STORE_FORMAT}). Use that version, delete it with --fresh, or name another --work-dir."
             )
         for table in TABLES:
-            # Reads the index of a table. Other pages are read when they are needed, which costs a job at most.
+            # Reads the index of a table. Other pages are read when they are needed, which costs a job.
             db.execute(f"SELECT count(*) FROM {table}")
         opened.pop_all()
     return db

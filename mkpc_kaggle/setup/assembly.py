@@ -24,7 +24,15 @@ from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.devices import AUTO, gpus_of, resolve_placement
 from mkpc_kaggle.matchers.registry import MATCHERS, load_matcher, require_matchers, spec_of
-from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe, recipe_names, with_settings
+from mkpc_kaggle.recipe import (
+    Mode,
+    Recipe,
+    Unit,
+    load_recipe,
+    recipe_names,
+    split_mode,
+    with_settings,
+)
 from mkpc_kaggle.version import __version__
 from mkpc_kaggle.weights import FoundFile, WeightStore
 
@@ -107,7 +115,7 @@ class Assembly:
             settings["version"] = spec.version or self.nonce
         if spec.packages:
             settings["packages"] = {
-                package: _version_of_package(package) for package in spec.packages
+                package: version_of_package(package) for package in spec.packages
             }
         return settings
 
@@ -144,19 +152,22 @@ def assemble(
     weights: Weights = (),
     device: str = AUTO,
     precision: str = Precision.FLOAT32,
-    mode: Mode = Mode.TWO_STAGE,
     scenes: bool | None = None,
     matchers: Mapping[str, Matcher[Any]] | None = None,
     settings: Mapping[str, Any] = MappingProxyType({}),
 ) -> Assembly:
     """Check recipe, options, weights, device and precision; return the assembly.
 
-    ``recipe`` may be the name of a single matcher. ``weights`` are directories, or files by slot.
+    ``recipe`` may be the name of a single matcher; of a text, ``:MODE`` at the end is a :class:`Mode`. ``weights``
+    are directories, or files by slot.
     ``device`` and ``precision`` may be torch's. ``scenes`` switches the reconstruction of batches
     on or off; ``None`` follows the recipe. ``settings`` replace the recipe's, see
     :func:`mkpc_kaggle.recipe.with_settings`. Raises :class:`UserError`, also if weights of a
     recipe other than ``auto`` are missing.
     """
+    mode = Mode.TWO_STAGE
+    if not isinstance(recipe, Recipe):
+        recipe, mode = split_mode(os.fspath(recipe))
     own = dict(matchers or {})
     require_matchers(own)
     directories, files = weights_of(weights)
@@ -207,7 +218,7 @@ def listed(missing: Mapping[str, Iterable[str]], store: WeightStore) -> str:
 
 def fetch_command(recipe: Recipe, missing: Mapping[str, Iterable[str]]) -> str:
     """Return the command that gets a recipe's missing weights."""
-    # ``weights fetch`` knows the names of the package's recipes only.
+    # A recipe from a file has no name that ``weights fetch`` knows.
     slots = dict.fromkeys(slot for names in missing.values() for slot in names)
     what = recipe.name if recipe.name in recipe_names() else " ".join(slots)
     return f"mkpc weights fetch {what} --out DIR"
@@ -274,7 +285,8 @@ def recipe_of_matcher(name: str) -> Recipe:
     )
 
 
-def _version_of_package(name: str) -> str:
+def version_of_package(name: str) -> str:
+    """Return the version of an installed distribution; empty without it."""
     # OpenCV has several distributions.
     if name == "opencv":
         return cv2.__version__

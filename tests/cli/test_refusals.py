@@ -45,6 +45,10 @@ REFUSALS = [
         "validate --train-dir demo/train --json demo/train/scaling_factors.csv",
         "would overwrite the input",
     ),
+    (
+        "validate --train-dir demo/train --compare auto small.toml:stage-1 --json small.toml",
+        "would overwrite the input small.toml",
+    ),
     (f"{MATCH} x.png", "would overwrite the input"),
     # matplotlib would add a suffix.
     (f"{MATCH} x", "needs a suffix"),

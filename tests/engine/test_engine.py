@@ -18,11 +18,9 @@ from rectified import (
     write_pairs,
 )
 
-from mkpc_kaggle.engine import keys
 from mkpc_kaggle.engine.frames import Results
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.signals import Interrupt
 
 
@@ -97,20 +95,8 @@ def test_an_interrupted_run_resumes_and_ends_with_the_same_bytes(tmp_path):
     assert second.calls
 
 
-def test_a_finished_run_reads_no_image_and_loads_no_matcher_again(tmp_path, monkeypatch):
-    pairs = write_pairs(tmp_path, 3)
-    once = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    # Loading gigabytes of weights to find that nothing is missing would take minutes.
-    monkeypatch.setattr(Pipeline, "load", lambda *_: pytest.fail("it is loaded"))
-    monkeypatch.setattr(keys, "image_facts", lambda *_: pytest.fail("it is read"))
-    twice = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-
-    assert matrices(once) == matrices(twice)
-    assert twice.about.resumed == 3
-
-
 @pytest.mark.parametrize(
-    ("limit", "ending"), [(5.0, Ending.TIME_IS_UP), (math.inf, Ending.INTERRUPTED)]
+    ("limit", "ending"), [(3.0, Ending.TIME_IS_UP), (math.inf, Ending.INTERRUPTED)]
 )
 def test_a_unit_that_never_returns_holds_the_run_neither_past_its_limit_nor_after_an_interrupt(
     tmp_path, limit, ending

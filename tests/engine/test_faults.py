@@ -340,13 +340,6 @@ def test_the_watchdog_exits_even_if_writing_hangs_with_the_status_of_the_run(bod
     assert stuck(body).returncode == status
 
 
-def test_the_watchdog_leaves_no_unfinished_file(tmp_path):
-    report = f"replacing(Path({str(tmp_path / 'report.html')!r}))"
-    body = f"from mkpc_kaggle.data.outputs import replacing, Path; open = {report}; open.__enter__()"
-    assert stuck(f"session.save = lambda: ''; {body}").returncode == 0
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_that_the_parent_program_ignores_is_ignored(number):
     # A shell lets its background jobs ignore Ctrl-C.

@@ -99,10 +99,10 @@ def test_another_version_of_a_library_changes_the_points_that_come_from_it(
     made = replace(assemble(CLASSICAL), recipe=replace(CLASSICAL, units=units))
     monkeypatch.setattr(Assembly, "weight_files", {})
     former = Keys.of(made).units
-    version_of = assembly._version_of_package
+    version_of = assembly.version_of_package
     other = {package: "another"}
     monkeypatch.setattr(
-        assembly, "_version_of_package", lambda name: other.get(name) or version_of(name)
+        assembly, "version_of_package", lambda name: other.get(name) or version_of(name)
     )
     pairs = zip(former, Keys.of(made).units, strict=True)
     assert [before != after for before, after in pairs] == changed

@@ -193,6 +193,8 @@ def test_a_place_that_lost_jobs_continues_elsewhere_with_one_unit():
     # Neighbours share an image.
     assert [job.pairs[0] for job in jobs] == [0, 3, 6, 6]
     assert [len(job.units) * len(job.pairs) for job in jobs[1:]] == [1, 1, 1]
+    # A photograph that is decoded ahead may be the cause of the losses.
+    assert [len(job.upcoming) > 0 for job in jobs] == [True, False, False, False]
 
 
 def test_a_part_of_many_due_estimates_is_handed_out_and_nothing_forgets_the_others(

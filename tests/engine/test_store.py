@@ -1,5 +1,6 @@
 """The store: rows are saved all or none, a full disk costs none, readers do not block a run."""
 
+import resource
 import sqlite3
 import subprocess
 import sys
@@ -13,6 +14,8 @@ from store_room import Room
 from mkpc_kaggle.engine.frames import results_of
 from mkpc_kaggle.engine.store import FILE_NAME, Store, connected
 from mkpc_kaggle.errors import UserError
+
+POINTS: Any = ("points", 0, 0, 0.0, None, None, "", "", b"")
 
 
 def put(store: Store, *numbers: int) -> None:
@@ -48,8 +51,7 @@ def test_rows_that_a_full_disk_refuses_stay_in_memory_and_are_written_later(
         store.put({"run": [(0, 1, "second")]})
         assert store.db.execute("SELECT about FROM run").fetchall() == [("second",)]
         # The worker that estimates F gets points that only memory has.
-        row: Any = ("points", 0, 0, 0.0, None, None, "", "", b"")
-        store.put({"points": [row]})
+        store.put({"points": [POINTS]})
         assert len(store.source(["points"]).matches(["points"])["points"]) == 0
         # The user deletes files: the next write takes all.
         store.db.execute("PRAGMA main.max_page_count = 100000")
@@ -69,6 +71,7 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 with Store.open(Path(sys.argv[1])) as store:
     store.put({"result": [("new", "2")]})
     print(store.facts(["former", "new"]), bool(store.trouble))
+    store.source(["points"]).matches(["points"] if store.facts(["former"]) else [])
 """
 
 
@@ -80,7 +83,7 @@ def test_a_disk_that_is_full_from_the_start_costs_no_result(
 ) -> None:
     if former:
         with Store.open(tmp_path) as store:
-            store.put({"result": former.items()})
+            store.put({"result": former.items(), "points": [POINTS]})
     process = put_into(tmp_path, kib)
     assert process.stderr == ""
     assert process.stdout in (
@@ -96,6 +99,23 @@ def put_into(directory: Path, kib: int) -> "subprocess.CompletedProcess[str]":
         text=True,
         capture_output=True,
     )
+
+
+def test_the_tables_of_a_long_run_need_no_disk(whole: Room) -> None:
+    db = whole.store.db
+    db.execute(
+        """REPLACE INTO main.pair SELECT number.value, pair.id || number.value, batch, image0, image1, units,
+        estimate, F, source, choice, error FROM main.pair, json_each(?) AS number WHERE pair.key = 0""",
+        [str([*range(9000)])],
+    )
+    db.execute("UPDATE main.run SET rows = 9000")
+    free, limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, limit))
+    try:
+        found = results_of(whole.store)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (free, limit))
+    assert len(found.units) > len(found.pairs) == 9000
 
 
 def test_a_disk_without_a_free_byte_is_refused_in_one_line(tmp_path: Path) -> None:

@@ -85,14 +85,6 @@ def test_a_stderr_that_is_not_read_costs_lines_and_not_the_run():
     assert (done.returncode, done.stdout) == (0, b"done\n")
 
 
-def test_a_run_that_shows_no_progress_prints_nothing(capsys):
-    progress = Progress(is_shown=False)
-    progress.count("sweep", 1, 2, "unit")
-    progress.note("text")
-    progress.close()
-    assert capsys.readouterr() == ("", "")
-
-
 def test_a_file_gets_a_line_when_a_count_begins_and_at_its_end(capsys):
     progress = Progress()
     for done in range(40, 101):  # resumed pairs took no time of this run

@@ -229,6 +229,7 @@ def test_the_name_of_a_matcher_is_a_recipe(tmp_path):
     )
     (unit,) = TwoStageMatcher("own", matchers={"own": Own(fail)}).recipe.units
     assert unit == Unit(1, "own", 1024)
+    assert TwoStageMatcher("classical:stage-1").recipe.name == "classical (stage-1)"
 
 
 def test_a_model_of_another_name_is_refused():
