@@ -130,7 +130,7 @@ class PairMatch:
         for unit, data, text in stored:
             if data is not None:
                 results.append(UnitResult(unit, Matches.from_bytes(data)))
-            regions = regions or regions_of(text)
+            regions = regions_of(text) or regions
         match = cls(tuple(results), regions)
         return replace(match, estimate=Estimate.of_nearest(F, match.matches, count, failure))
 

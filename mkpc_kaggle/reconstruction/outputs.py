@@ -21,7 +21,7 @@ from mkpc_kaggle.scene.models import DATABASE, MODELS, SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 WORK = "work"
-# In WORK: COLMAP's files of each scene by its key, and the largest model of the last run
+# In WORK: COLMAP's files of each scene by its key, and the largest model of the last complete run
 SCENES, FORMER = "scenes", "former"
 TABLE = "cameras.csv"
 PAGE = "report.html"
@@ -44,7 +44,7 @@ def require_out(out: Path, inputs: Iterable[Path]) -> None:
                 f"--out {out} contains, or lies in, the input {path}; name another folder"
             )
     with writing(f"--out {out}"):
-        (out / WORK).mkdir(parents=True, exist_ok=True)
+        out.mkdir(parents=True, exist_ok=True)
         names = {path.name for path in out.iterdir() if not path.name.startswith(".")} - {
             WORK
         }
@@ -52,10 +52,9 @@ def require_out(out: Path, inputs: Iterable[Path]) -> None:
             raise UserError(
                 f"--out {out} has {min(names)}, and no run of this command made it; name an empty folder"
             )
-        for left in out.glob(f"{PART}*"):  # of a process that was killed
-            shutil.rmtree(left, ignore_errors=True)
         # A folder that cannot be written is found now, and not after hours.
         TemporaryDirectory(prefix=PART, dir=out).cleanup()
+        (out / WORK).mkdir(exist_ok=True)
 
 
 def remove_results(out: Path, results: Iterable[str] = RESULTS) -> None:
@@ -67,11 +66,10 @@ def remove_results(out: Path, results: Iterable[str] = RESULTS) -> None:
 
 
 def keep_former(out: Path) -> None:
-    """Keep the largest model of the last run, onto which those of this run are moved."""
-    with writing(f"--out {out}"):
-        shutil.rmtree(out / WORK / FORMER, ignore_errors=True)
-        if (out / MODELS / "0").is_dir():
-            shutil.copytree(out / MODELS / "0", out / WORK / FORMER)
+    """Keep the largest model of a complete run, onto which those of later runs are moved."""
+    with writing(f"--out {out}"), TemporaryDirectory(prefix=PART, dir=out) as name:
+        shutil.copytree(out / MODELS / "0", Path(name) / FORMER)
+        replace_results(Path(name), out / WORK, [FORMER])
 
 
 class Writer:
@@ -90,13 +88,13 @@ class Writer:
     def __exit__(self, *_: object) -> None:
         if self._child is not None:
             self._child.kill()
+            for left in self._out.glob(f"{PART}*"):  # of a process that was killed
+                shutil.rmtree(left, ignore_errors=True)
 
     def update(self, scene: str) -> None:
         """Begin to write the files of the scene with this key."""
         folder = self._out / WORK / SCENES / scene
         if scene != self._scene:
-            if self._child is None:
-                keep_former(self._out)
             self.__exit__()
             self._scene = scene
             self._child = Child(write_results, self._root, self._out, folder)
@@ -113,8 +111,8 @@ class Writer:
 
 
 def write_results(root: Path, out: Path, scene: Path) -> Iterator[list[SfmModel]]:
-    """Write the models of the scene to ``out``, moved onto the former model; yield them. Then write
-    ``images`` and ``sparse``, and yield again.
+    """Write the models of the scene to ``out``, moved onto the former model, then ``images`` and ``sparse``. Yield
+    the models, and once more if all is written.
 
     Only whole files replace former ones. Raises ``OSError`` if writing fails.
     """
@@ -136,14 +134,13 @@ def write_results(root: Path, out: Path, scene: Path) -> Iterator[list[SfmModel]
             model.write(folder)
         with (made / TABLE).open("w", newline="", encoding="utf-8") as stream:
             csv.writer(stream, lineterminator="\n").writerows(camera_rows(found))
+        shutil.copy2(scene / DATABASE, made / DATABASE)
+        replace_results(made, out)
         try:
-            os.link(scene / DATABASE, made / DATABASE)
-        except OSError:  # a file system without links
-            shutil.copy2(scene / DATABASE, made / DATABASE)
-        replace_results(made, out)
-        yield found
-        undistort(models, root, out, made)
-        replace_results(made, out)
+            undistort(models, root, out, made)
+            replace_results(made, out)
+        finally:
+            yield found  # last: a child waits here until the run has ended
     yield []
 
 
@@ -223,10 +220,12 @@ def undistort(models: Sequence[Any], root: Path, out: Path, made: Path) -> None:
     for number, model in enumerate(models):
         for image in images_of(model):
             file = (root / image.name).resolve()
-            image.name = image.name.replace("/", "_")
-            # An image may be in two models.
-            if files.setdefault(image.name, file) is file:
-                (photographs / image.name).symlink_to(file)
+            name = image.name.replace("/", "_")
+            while files.setdefault(name, file) != file:  # of a/b.jpg and a_b.jpg
+                name = f"_{name}"
+            image.name = name
+            if not (photographs / name).exists():  # an image may be in two models
+                (photographs / name).symlink_to(file)
         model.extract_colors_for_all_images(photographs)
         model.write(source)
         links = pycolmap.FileCopyType.softlink
@@ -240,10 +239,10 @@ def undistort(models: Sequence[Any], root: Path, out: Path, made: Path) -> None:
         shutil.rmtree(target)
 
 
-def replace_results(made: Path, out: Path) -> None:
+def replace_results(made: Path, out: Path, results: Iterable[str] = RESULTS) -> None:
     """Move the results in ``made``, a temporary folder, to ``out`` once they are on the disk."""
     sync(made)
-    for name in RESULTS:
+    for name in results:
         if (made / name).exists():
             if (out / name).is_dir():
                 (out / name).replace(made / f"former-{name}")

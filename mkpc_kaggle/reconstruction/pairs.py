@@ -8,6 +8,7 @@ from itertools import combinations
 from pathlib import Path
 
 from mkpc_kaggle.cores import available_cores
+from mkpc_kaggle.data.images import file_state
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.reconstruction.folder import Ends
@@ -25,7 +26,7 @@ def choose_pairs(files: Sequence[Path], work: Path, ends: float) -> list[Ends]:
     if len(files) <= MAX_IMAGES:
         return list(combinations(files, 2))
     path = work / "shortlist.json"
-    key = [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
+    key = [[str(file), *file_state(file)] for file in files]
     kept = None
     with suppress(OSError, ValueError):  # a first run
         kept = json.loads(path.read_text(encoding="utf-8"))

@@ -15,7 +15,7 @@ from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.errors import UserError, plural, temporary_directory
+from mkpc_kaggle.errors import UserError, plural, printable, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.recipe import CameraModel, CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reconstruction.folder import (
@@ -31,6 +31,7 @@ from mkpc_kaggle.reconstruction.outputs import (
     SCENES,
     WORK,
     Writer,
+    keep_former,
     remove_results,
     require_out,
 )
@@ -41,6 +42,7 @@ from mkpc_kaggle.setup.console import logger
 from mkpc_kaggle.signals import Interrupt, interruptible
 
 AUTO_RECIPE = "auto"  # the recipe of all matchers whose weights are found
+WARNING_S = 0.5  # before the end, for the line that says why OUT is not complete
 # Of MAGSAC on a pair, whose F is for the report alone. Pairs that do not overlap run all iterations.
 # On 20 pairs of reichstag_26, 2,000 take 15 ms a pair and 10,000 take 24 ms. They find 1.00 of the
 # inliers.
@@ -200,7 +202,9 @@ def _run(
     from mkpc_kaggle.reporting.page import report_run
     from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
-    batch = root.resolve().name or "images"  # the root of the file system has no name
+    batch = (
+        printable(root.resolve().name) or "images"
+    )  # the root of the file system has no name
     names = {file: file.relative_to(root).as_posix() for file in files}
     pairs = [Pair(f"{names[a]} {names[b]}", batch, str(a), str(b)) for a, b in ends]
     recipe = assembly.recipe
@@ -227,17 +231,20 @@ def _run(
         failures = report.about.failures
         problems = [trouble(report), report.about.unwritten, report.about.unsaved, *failures]
         has_models = report.scenes["models"].any()
+        say(summary(report))
+        last = session.must_end() - WARNING_S
         models: list[SfmModel] = []
         try:
-            models = writer.next(session.must_end())
-            writer.next(session.must_end())
+            with session.interrupt.raising():
+                say(report_run(session.work_dir, out / PAGE, last, pairs))
+                models = writer.next(last)
+                writer.next(last)
+            if models and report.ending.is_done:
+                keep_former(out)
         except UserError as error:
             problems.append(f"{out} is not complete: {error}; the same command completes it")
         if report.ending.is_done and not has_models and not failures:
             models = []
             # A scene without models has its database and an empty table.
             remove_results(out, FOLDERS if writer.has_scene else RESULTS)
-    say(summary(report))
-    session.status = int(not models)
-    say(report_run(session.work_dir, out / PAGE, session.must_end(), pairs))
     return tuple(models), list(filter(None, problems))

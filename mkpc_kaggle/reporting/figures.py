@@ -35,10 +35,8 @@ def save(figure: "Figure", path: Path) -> None:
         raise UserError(f"the figure {path} cannot be written: {error}") from error
 
 
-def encode(figure: "Figure", kind: str, dpi: int = DPI) -> bytes:
-    """Return the encoded figure; ``kind`` is "png" for lines and text, or "jpeg" for photographs."""
+def encode(figure: "Figure", dpi: int = DPI) -> bytes:
+    """Return the figure as JPEG: photographs as PNG would be many times as large."""
     stream = BytesIO()
-    # Photographs as PNG would be many times as large.
-    options = {"quality": 82} if kind == "jpeg" else None
-    figure.savefig(stream, format=kind, dpi=dpi, pil_kwargs=options)
+    figure.savefig(stream, format="jpeg", dpi=dpi, pil_kwargs={"quality": 82})
     return stream.getvalue()

@@ -181,8 +181,6 @@ def pictures(found: Results, pairs: Sequence[Pair]) -> Iterator[str]:
                 as_image(path).turned(turns)
                 for path, turns in zip(pair.images, pair.turns, strict=True)
             )
-            data = base64.b64encode(
-                encode(draw_strip((first, second), match), "jpeg")
-            ).decode()
+            data = base64.b64encode(encode(draw_strip((first, second), match))).decode()
             image = f'<img src="data:image/jpeg;base64,{data}" alt="{escape(caption)}">'
             yield f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"

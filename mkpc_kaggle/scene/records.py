@@ -14,7 +14,7 @@ from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, models_of
 
 NOT_RECONSTRUCTED = "not reconstructed yet"
 NO_CAMERAS = "no matches connect its images"
-MAX_DRAWN_POINTS = 5000  # of a model, which are 60 kB in the store and enough for a picture
+MAX_DRAWN_POINTS = 5000  # of a model, which are 80 kB in the store and enough for a picture
 # Columns of ``SceneRecord.cameras``
 CAMERAS = ["model", "image", "digest", "width", "height", "focal", "points", "K", "R", "t"]
 CAMERAS += ["camera_model", "parameters"]

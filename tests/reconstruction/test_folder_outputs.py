@@ -1,6 +1,7 @@
 """OUT: whose it must be, models in the coordinates of the former ones, folders for other programs."""
 
 import shutil
+from math import inf
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from mkpc_kaggle.engine.store import FILE_NAME
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.reconstruction import outputs
 from mkpc_kaggle.reconstruction.outputs import (
+    Writer,
     keep_former,
     remove_results,
     require_out,
@@ -54,7 +56,7 @@ def write_scene(model: pycolmap.Reconstruction, out: Path) -> None:
     (folder.parent.parent / "database.db").write_bytes(b"database")
 
 
-NAMES = ["a.png", "b.png", "inner/a.png", "d.png"]
+NAMES = ["a.png", "b.png", "inner/a.png", "inner_a.png"]
 
 
 def centres(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
@@ -68,12 +70,13 @@ def test_an_empty_out_and_that_of_an_earlier_run_are_taken(tmp_path):
     # A run that was killed before it had a journal
     require_out(out, [])
     (out / "models").mkdir()
+    (out / "work").rmdir()
     with pytest.raises(UserError, match="has models, and no run of this command"):
         require_out(out, [])
+    assert sorted(path.name for path in out.iterdir()) == [".DS_Store", "models"]
+    (out / "work").mkdir()
     (out / "work" / FILE_NAME).touch()
-    (out / ".mkpc-new-x" / "models").mkdir(parents=True)
     require_out(out, [])
-    assert sorted(path.name for path in out.iterdir()) == [".DS_Store", "models", "work"]
 
 
 @pytest.mark.parametrize("out", ["images", "images/out", "."])
@@ -84,15 +87,28 @@ def test_an_out_in_an_input_or_around_it_is_refused(tmp_path, out):
     assert [path.name for path in tmp_path.iterdir()] == ["images"]
 
 
+def test_files_of_a_writer_that_was_killed_are_removed(tmp_path):
+    out = tmp_path / "out"
+    (out / ".mkpc-new-x" / "models").mkdir(parents=True)
+    with Writer(tmp_path, out) as writer:
+        writer.update("none")
+        with pytest.raises(UserError, match="No such file"):
+            writer.next(inf)
+    assert list(out.iterdir()) == []
+
+
 def test_pinholes_are_links_that_move_with_the_folders(tmp_path):
     out = tmp_path / "project" / "out"
     write_scene(model_of(NAMES, tmp_path / "project" / "images"), out)
-    list(write_results(tmp_path / "project" / "images", out, out / "work" / "scene"))
+    # All is written before the first value, for which a child waits until it is read.
+    next(write_results(tmp_path / "project" / "images", out, out / "work" / "scene"))
+    assert (out / "database.db").stat().st_nlink == 1, "COLMAP may write to it"
     (tmp_path / "project").rename(tmp_path / "renamed")
     out = tmp_path / "renamed" / "out"
     assert sorted(path.name for path in (out / "images").iterdir()) == [
-        *("a.png", "b.png", "d.png", "inner_a.png")
+        *("_inner_a.png", "a.png", "b.png", "inner_a.png")
     ]
+    assert (out / "images" / "_inner_a.png").resolve().name == "inner_a.png"
     for path in (out / "images").iterdir():
         assert path.is_symlink() and path.exists()
     assert sorted(path.name for path in out.iterdir()) == [

@@ -26,12 +26,15 @@ from synthetic import QUICK, SyntheticMatcher
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle import results
 from mkpc_kaggle.data.images import TURNS
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.session import Session
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.recipe import CameraModel, Recipe, SceneConfig, Unit
 from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct
 from mkpc_kaggle.scene.models import SfmModel
 from mkpc_kaggle.setup.assembly import assemble
+from mkpc_kaggle.signals import Interrupt
 
 PAGES = {"report.html"}  # it tells of times
 RECIPE = for_cameras(Recipe((Unit(1, "synthetic", SIZE.width),), magsac=QUICK))
@@ -253,6 +256,9 @@ def test_new_photographs_cost_their_own_pairs(tmp_path):
     assert sorted(more.calls) == [(number, FIRST - 1) for number in range(FIRST - 1)]
     assert len(grown.images) == FIRST
     assert len(results(tmp_path / "out" / "work").pairs) == FIRST * (FIRST - 1) // 2
+    fresh = Session(tmp_path / "out" / "work", Budget(0.0), Interrupt(), fresh=True)
+    run(root, tmp_path / "out", session=fresh)
+    assert len([*(tmp_path / "out" / "work" / "scenes").iterdir()]) == 1
 
 
 def test_models_of_an_earlier_run_are_removed_once_no_image_has_a_match(tmp_path):
@@ -290,6 +296,7 @@ def test_only_listed_pairs_are_matched(tmp_path):
     wanted = list(combinations(range(4), 2))[:5]
     lines = (f"set/{j:02}.png set/{i:02}.png\n" for i, j in wanted)
     (tmp_path / "pairs.txt").write_text("".join(lines))
+    root = root.rename(tmp_path / os.fsdecode(b"caf\xe9"))
     matcher = MixedMatcher()
     run(root, tmp_path / "out", matcher, pairs=tmp_path / "pairs.txt")
     assert sorted(matcher.calls) == wanted

@@ -28,7 +28,7 @@ def test_a_strip_shows_both_images_upright_at_one_height_with_matches_where_they
     result = UnitResult(Unit(1, "sift", 100), Matches(point0, point1, np.ones(1)))
     found = Estimate(ModelKind.F, np.eye(3), np.array([True]))
     figure = draw_strip((lying, square), PairMatch((result,), None, found))
-    jpeg = np.frombuffer(encode(figure, "jpeg"), np.uint8)
+    jpeg = np.frombuffer(encode(figure), np.uint8)
     drawn = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)
     # Older versions of matplotlib round down
     assert drawn.shape[:2] == pytest.approx((480, 960 + 480), abs=1)
