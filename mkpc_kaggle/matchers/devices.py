@@ -17,9 +17,9 @@ def resolve_placement(device: str, precision: str) -> Placement:
     ``auto`` means all GPUs ("cuda"), or "cpu" if PyTorch has none. Raises :class:`UserError` for an
     unknown name or a missing GPU.
     """
-    import torch
-
     if device == AUTO:
+        import torch
+
         device = "cuda" if torch.cuda.is_available() else "cpu"
     elif device != "cpu":
         gpus_of(device)
