@@ -28,23 +28,25 @@ class OrbMatcher(PairwiseMatcher):
     spec = SPEC
 
     def encode(self, pictures):
-        """Return keypoints and descriptors of each picture. They are cached for its other pairs."""
+        """Return points and descriptors of each picture. They are cached for its other pairs."""
         orb = cv2.ORB_create(4000)
-        return [orb.detectAndCompute(picture.pixels, None) for picture in pictures]
+        found = [orb.detectAndCompute(picture.pixels, None) for picture in pictures]
+        # Arrays, whose bytes the cache can count
+        return [(cv2.KeyPoint.convert(keypoints), features) for keypoints, features in found]
 
     def _match(self, first, second):
         """Return the matches of two encodings, in pixels of the two pictures."""
-        keypoints0, descriptors0 = first
-        keypoints1, descriptors1 = second
+        points0, descriptors0 = first
+        points1, descriptors1 = second
         # OpenCV has no descriptors, instead of an empty array, for a picture without keypoints.
         if descriptors0 is None or descriptors1 is None:
             return Matches.empty()
         neighbours = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
         pairs = neighbours.match(descriptors0, descriptors1)
-        points0 = [keypoints0[pair.queryIdx].pt for pair in pairs]
-        points1 = [keypoints1[pair.trainIdx].pt for pair in pairs]
+        index0 = [pair.queryIdx for pair in pairs]
+        index1 = [pair.trainIdx for pair in pairs]
         scores = [1 - pair.distance / 256 for pair in pairs]  # 256 bits; higher is better
-        return Matches(points0, points1, scores)
+        return Matches(points0[index0], points1[index1], scores)
 
 
 def load(weights, options, placement):

@@ -192,13 +192,15 @@ class PairwiseMatcher(Generic[Encoding]):
 
 
 def arrays_of(value: Any) -> Iterator[Any]:
-    """Yield the arrays and tensors in nested dataclasses, tuples and lists."""
+    """Yield the arrays and tensors in nested dataclasses, dictionaries, tuples and lists."""
     # NumPy's arrays and PyTorch's tensors alike, without importing torch.
     if hasattr(value, "nbytes"):
         yield value
     elif is_dataclass(value):
         for field in fields(value):
             yield from arrays_of(getattr(value, field.name))
+    elif isinstance(value, dict):
+        yield from arrays_of([*value.values()])
     elif isinstance(value, tuple | list):
         for item in value:
             yield from arrays_of(item)

@@ -55,8 +55,9 @@ class Keypoints:
         # Pixel centres are at integers, so the first pixel begins at -0.5.
         upper = points.new_tensor(content) - 0.5
         kept = ((points >= -0.5) & (points < upper)).all(dim=1)
-        kept_shapes = [shape[kept] for shape in shapes]
-        return cls(points[kept], descriptors[kept], content, *kept_shapes)
+        return cls(
+            points[kept], descriptors[kept], content, *(shape[kept] for shape in shapes)
+        )
 
     def __len__(self) -> int:
         return len(self.points)
@@ -71,14 +72,11 @@ def keypoint_encoder(detect: Detector, placement: Placement) -> Encode:
     @torch.inference_mode()
     def encode(pictures: Sequence[Picture]) -> list[Keypoints]:
         found = detect(image_batch(pictures, placement.device))
-        encodings = []
-        for (points, descriptors), picture in zip(found, pictures, strict=True):
-            # A library's network may return half precision.
-            on_content = Keypoints.on_content(
-                points.float(), descriptors.float(), picture.content
-            )
-            encodings.append(on_content)
-        return encodings
+        # A library's network may return half precision.
+        return [
+            Keypoints.on_content(points.float(), descriptors.float(), picture.content)
+            for (points, descriptors), picture in zip(found, pictures, strict=True)
+        ]
 
     return encode
 
@@ -120,6 +118,5 @@ def image_batch(pictures: Sequence[Picture], device: str) -> Tensor:
     stacked = np.stack([picture.pixels for picture in pictures])
     # As bytes, a quarter of the floats' traffic to a GPU.
     batch = torch.from_numpy(stacked).to(device)
-    is_gray = stacked.ndim == 3
-    batch = batch[:, None] if is_gray else batch.permute(0, 3, 1, 2)
+    batch = batch[:, None] if stacked.ndim == 3 else batch.permute(0, 3, 1, 2)
     return batch.float() / 255

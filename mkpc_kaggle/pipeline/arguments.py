@@ -49,7 +49,7 @@ def as_image(source: ImageSource, store: ImageStore | None = None) -> Image:
         turns, focal = exif_facts(exif_tags(source), image.size)
         return replace(image, turns=turns, focal=focal)
     array = _array_of(source)
-    if array is not source and array.ndim == 3:
+    if hasattr(source, "detach") and array.ndim == 3:
         array = np.moveaxis(array, 0, 2)  # of a tensor
     if array.shape[2:] == (1,):
         array = array[..., 0]

@@ -260,11 +260,12 @@ class Pipeline:
         """Switch the matcher to float32. Return False if it cannot, or has switched before."""
         if self._load_float32 is None or name in self._notes:
             return False
+        # First, since it may fail: then the next pair tries it again.
+        self._matchers[name] = self._load_float32(name)
         self._notes[name] = f"{name} runs in float32, for in half precision {error}"
         warnings.warn(self._notes[name], RuntimeWarning, stacklevel=2)
         # Encodings in half precision would be matched in float32.
         self._encodings = ByteCache(self._encodings.limit)
-        self._matchers[name] = self._load_float32(name)
         return True
 
     def _match(self, unit: Unit, pairs: list[PairMatch]) -> list[UnitResult]:
@@ -312,7 +313,7 @@ class Pipeline:
     def _encode(self, unit: Unit, wanted: Sequence[tuple[Image, View]]) -> list[Any]:
         """Return the encodings of views: cached, or computed one shape at a time."""
         matcher = self._matcher(unit.matcher)
-        is_gray = matcher.spec.colour is Colour.GRAY
+        is_gray = matcher.spec.colour == Colour.GRAY  # or its text
         # Units of one matcher that see the same view share its encoding. By content: a file that is
         # replaced during a run keeps its name.
         keys = [(unit.matcher, image.version or image.name, view) for image, view in wanted]
@@ -412,7 +413,7 @@ def need_of(unit: Unit, pair: PairMatch, recipe: Recipe) -> CropNeed:
 
 def _scale_of(unit: Unit, crop: Box) -> float:
     """Return the view pixels per image pixel of a unit's view of a crop, the smaller of both axes."""
-    # Neither padding nor turns change it.
+    # Padding does not change it, nor do turns, unless the view is stretched.
     return min(unit.view(crop, multiple=1).scale)
 
 

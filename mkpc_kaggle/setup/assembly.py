@@ -302,4 +302,4 @@ def _warn_of_unverified(files: Iterable[FoundFile]) -> None:
     """Warn of weights without a digest, if there are any."""
     names = sorted(file.path.name for file in files if not file.is_verified)
     if names:
-        warn_once(f"weights not verified: {', '.join(names)}; `mkpc weights verify` says why")
+        warn_once(f"weights not verified, no digest is known: {', '.join(names)}")

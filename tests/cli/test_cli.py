@@ -19,7 +19,7 @@ def test_importing_the_package_is_cheap_and_geometry_and_weights_bring_no_torch(
     # torch takes seconds to import, which `mkpc --help` and processes that estimate would all pay.
     code = (
         "import sys, pkgutil, importlib, mkpc_kaggle\n"
-        "print([m for m in ('torch', 'cv2', 'numpy') if m in sys.modules])\n"
+        "print([m for m in ('torch', 'cv2', 'numpy', 'pandas') if m in sys.modules])\n"
         "import mkpc_kaggle.geometry as g, mkpc_kaggle.weights\n"
         "for module in pkgutil.iter_modules(g.__path__):\n"
         "    importlib.import_module(f'{g.__name__}.{module.name}')\n"

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+import torch
 from shared import run_command
 from web import Site, serve
 from weight_files import DATA, OTHER, line, put
@@ -66,10 +67,12 @@ def test_fetch_takes_files_slots_and_recipes(tmp_path, monkeypatch, capsys):
     recipe.write_text('units = [{stage = 1, matcher = "aliked", long_side = 320}]')
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     out = tmp_path / "out"
-    with serve(Site(DATA)) as site:
+    torch.save({}, tmp_path / "b.pt")  # without a digest, it must be a checkpoint
+    data = (tmp_path / "b.pt").read_bytes()
+    with serve(Site(data)) as site:
         # The second has no address: its authors want a form to be filled in.
         files = (
-            line("sift.pt", slot="sift", url=site.url),
+            line("sift.pt", data, slot="sift", url=site.url),
             line("a.pt", OTHER, slot="aliked-n16", source="a form"),
             line("b.pt", slot="aliked-n16", size=0, sha256="", url=site.url),
         )

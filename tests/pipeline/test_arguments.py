@@ -20,7 +20,7 @@ from mkpc_kaggle import PairMatch, TwoStageMatcher
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec
+from mkpc_kaggle.matchers.contract import MatcherSpec
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.pipeline.arguments import as_image, intrinsics_of
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
@@ -62,6 +62,7 @@ def raises(call, error, *words):
 
 SAME = {  # forms of one image
     "uint8": lambda image: image,
+    "a subclass of an array": np.ma.array,
     "float64 in 0..1": lambda image: image / 255,
     "PIL, with alpha": lambda image: PIL.Image.fromarray(image).convert("RGBA"),
     "tensor (3, H, W)": chw,
@@ -260,7 +261,7 @@ def test_arguments_of_pairs_are_those_of_a_call():
 class Own:
     """A matcher of the user's, whose ``match`` is given."""
 
-    spec = MatcherSpec("own", colour=Colour.GRAY)
+    spec = MatcherSpec("own", colour="gray")
 
     def __init__(self, match):
         self.match = match

@@ -64,13 +64,16 @@ def test_a_good_file_is_not_asked_for_and_a_bad_one_is_replaced(
         ({"redirect": "file:///etc/hostname"}, "file:///etc/hostname"),
     ],
 )
+@pytest.mark.parametrize("known", [{}, {"size": 0, "sha256": ""}])
 def test_a_download_that_is_cut_off_wrong_or_refused_leaves_no_file(
-    site, tmp_path, downloads, fault, says
+    site, tmp_path, downloads, fault, says, known
 ):
     for name, value in fault.items():
         setattr(site, name, value)
+    if known:
+        says += "|cannot be read as a checkpoint"
     with pytest.raises(UserError, match=says):
-        downloads.fetch(line(data=BIG, url=site.url))
+        downloads.fetch(line(data=BIG, url=site.url, **known))
     assert names_in(tmp_path / "out") == []
 
 
@@ -81,10 +84,17 @@ def test_a_host_that_is_not_reached_is_tried_once(tmp_path, downloads, capfd):
     assert capfd.readouterr().err == "a.pt: trying 127.0.0.1\n"
 
 
-def test_a_folder_that_cannot_be_written_is_named(site, tmp_path):
+def fill(*_: object, **__: object) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def test_a_folder_that_cannot_be_written_is_named(site, tmp_path, downloads, monkeypatch):
     put(tmp_path, "file")
     with pytest.raises(UserError, match="cannot be written"):
         Downloads(tmp_path / "file" / "out", tmp_path).fetch(line(data=BIG, url=site.url))
+    monkeypatch.setattr("torch.hub.download_url_to_file", fill)
+    with pytest.raises(UserError, match="cannot be written: No space"):
+        downloads.fetch(line(url=site.url))
 
 
 def test_a_file_without_an_address_is_left_to_the_user(tmp_path, downloads):

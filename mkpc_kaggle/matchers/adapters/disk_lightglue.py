@@ -3,7 +3,6 @@
 DISK's network is kornia's.
 """
 
-from kornia.feature import DISK
 from torch import Tensor
 
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
@@ -25,12 +24,16 @@ SPEC = MatcherSpec(
 def load(
     weights: WeightStore, options: LightGlueOptions, placement: Placement
 ) -> LightGlueMatcher:
+    from kornia.feature import DISK  # here: without kornia, other matchers run
+
     network = DISK()
     load_into(network, weights.load("disk"), what="disk")
 
     def detect(images: Tensor) -> list[tuple[Tensor, Tensor]]:
-        found = network(images, n=options.features)
-        return [(each.keypoints, each.descriptors) for each in found]
+        return [
+            (found.keypoints, found.descriptors)
+            for found in network(images, n=options.features)
+        ]
 
     encode = library_encoder("disk", network, network.unet, detect, placement)
     return load_lightglue(SPEC, encode, weights, options, placement, SHAPE)

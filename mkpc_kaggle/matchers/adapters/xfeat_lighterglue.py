@@ -1,8 +1,8 @@
 """XFeat keypoints (kornia's network) matched by LighterGlue (Potje et al. 2024)."""
 
 from dataclasses import dataclass
+from typing import Any
 
-from kornia.feature import XFeat
 from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
@@ -31,21 +31,25 @@ SPEC = MatcherSpec(
 )
 
 
-def xfeat_network(features: int) -> XFeat:
+def xfeat_network(features: int) -> Any:
     """Return kornia's network without weights."""
+    from kornia.feature import XFeat  # here: without kornia, other matchers run
+
     network = XFeat(top_k=features)
     # For semi-dense matching only; some checkpoints do not have it.
     network.net.fine_matcher = nn.Identity()  # type: ignore[assignment]
     return network
 
 
-def xfeat_encoder(network: XFeat, features: int, placement: Placement) -> Encode:
+def xfeat_encoder(network: Any, features: int, placement: Placement) -> Encode:
     """Return the encoder of a loaded network, with up to ``features`` keypoints per picture."""
     fold_norms(network.eval())
 
     def detect(images: Tensor) -> list[tuple[Tensor, Tensor]]:
-        detected = network.detectAndCompute(images, top_k=features)
-        return [(image["keypoints"], image["descriptors"]) for image in detected]
+        return [
+            (found["keypoints"], found["descriptors"])
+            for found in network.detectAndCompute(images, top_k=features)
+        ]
 
     return library_encoder("xfeat", network, network.net, detect, placement)
 
