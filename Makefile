@@ -24,7 +24,7 @@ NEWEST_PYTHON = $(if $(IS_CHOSEN),$(PYTHON),$(shell for python in python3.13 $(P
     $(PYENV)/3.12*/bin/python; do $$python -c 0 2> /dev/null && echo $$python && break; done))
 # Each test runs on one thread.
 TEST_PROCESSES ?= 2
-# Folders and files whose tests need neither a run of the engine nor a network.
+# Folders and files whose tests take seconds.
 QUICK := tests/geometry tests/data tests/weights tests/scene tests/evaluation/test_compare.py tests/test_recipe.py \
     tests/test_errors.py tests/reporting/test_summary.py tests/reconstruction/test_folder.py tests/demo tests/test_bars.py \
     $(addprefix tests/engine/test_, budget.py keys.py store.py)

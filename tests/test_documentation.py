@@ -89,8 +89,8 @@ def test_pages_name_only_commands_and_options_that_exist(page):
         assert set(options) <= have, (name, set(options) - have)
 
 
-# Options of other programs that pages name: pip, kaggle, ray, accelerators of Kaggle, COLMAP, nerfstudio.
-OTHERS = {"--no-deps", "--follow", "--head", "--accelerator"}
+# Options of other programs that pages name: pip, kaggle, ray, COLMAP, nerfstudio.
+OTHERS = {"--no-deps", "--follow", "--head"}
 OTHERS |= {
     "--colmap-path",
     "--data",

@@ -1,8 +1,6 @@
 """The names of ``mkpc_kaggle``: documented in sections, with examples that run."""
 
 import doctest
-import subprocess
-import sys
 
 import pytest
 from pictures import write_two_views
@@ -50,11 +48,3 @@ def test_every_public_name_exists_and_is_listed_for_completion():
     for name in mkpc_kaggle.__all__:
         assert getattr(mkpc_kaggle, name) is not None
     assert {*mkpc_kaggle.__all__} <= {*dir(mkpc_kaggle)}
-
-
-def test_the_import_of_the_package_loads_no_library():
-    code = "import mkpc_kaggle, sys; print(*{'torch', 'numpy', 'cv2', 'pandas'} & {*sys.modules})"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.split() == []

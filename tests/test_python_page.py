@@ -37,7 +37,6 @@ def test_the_page_runs_from_top_to_bottom(names, tmp_path):
     assert names["match"].estimate.inlier_count > 50
     assert names["essential"].estimate.model == "E"
     assert not names["nothing"].estimate
-    assert isinstance(names["models"], tuple)
     assert len(names["tables"].pairs) == 3
 
 

@@ -262,7 +262,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize(
-    "moments", [2, pytest.param(20, marks=[pytest.mark.slow, pytest.mark.timeout(1200)])]
+    "moments", [1, pytest.param(20, marks=[pytest.mark.slow, pytest.mark.timeout(1200)])]
 )
 def test_a_parent_killed_at_any_moment_leaves_a_complete_file_no_orphans_and_a_resumable_run(
     pairs, undisturbed, tmp_path, moments
@@ -270,7 +270,7 @@ def test_a_parent_killed_at_any_moment_leaves_a_complete_file_no_orphans_and_a_r
     script = tmp_path / "run.py"
     script.write_text(KILLED.format(path=PATHS))
     mark = f"MKPC_TEST={tmp_path}"
-    rng = random.Random(moments)
+    rng = random.Random(0)  # the first moment is in the middle
     environment = {**os.environ, "MKPC_TEST": str(tmp_path)}
     for _ in range(moments):
         running = subprocess.Popen(

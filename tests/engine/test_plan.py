@@ -301,7 +301,7 @@ def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time():
 
 def test_planning_a_job_does_not_take_much_longer_for_many_pairs():
     seconds_per_pair = []
-    for count in (100, 1_000):
+    for count in (50, 500):
         # Of this thread, so that other load does not count
         start = time.thread_time()
         simulate(Scenario(count, (0.1, 0.5, 0.5), 2, count))
@@ -325,7 +325,7 @@ def test_scenes_are_done_in_parallel_with_matching_and_the_last_in_the_time_rese
 
 
 def test_a_scene_that_hangs_is_ended_and_the_others_have_their_turn():
-    ran = simulate(Scenario(900, (0.5, 1.0), 1, 7200.0, batches=9, scene_faults=0.4, seed=3))
+    ran = simulate(Scenario(300, (0.5, 1.0), 1, 7200.0, batches=9, scene_faults=0.4, seed=3))
     assert any(scene.seconds == math.inf for scene in ran.scenes)
     assert ran.late == ran.lost == ran.missed == 0
     assert any("the worker hung" in fault for fault in ran.report.about.faults)
@@ -399,8 +399,8 @@ def test_a_photograph_that_breaks_each_of_its_pairs_costs_no_place_and_no_other_
     assert units_of(ran) == 2 * 288
 
 
-@pytest.mark.parametrize("broken", [0.0, 0.3])
-def test_a_place_that_fails_is_closed_and_its_pairs_are_matched_elsewhere(broken):
+def test_a_place_that_fails_is_closed_and_its_pairs_are_matched_elsewhere():
+    broken = 0.3
     scenario = Scenario(300, (1.0, 1.0), 2, 900.0, bad_places=1, broken=broken, misses=0)
     ran = simulate(scenario)
     assert ran.closed == ("place 1",)

@@ -60,9 +60,9 @@ from mkpc_kaggle.setup.console import Progress, leave, logger, queued
 
 with queued():
     progress = Progress()
-    for number in range(20_000):
+    for number in range(4_000):
         progress.count("sweep", number % 2, 2, "unit")
-        logger.warning("pair %d of 20000 %s", number, 100 * "x")
+        logger.warning("pair %d of 4000 %s", number, 100 * "x")
     print("done", flush=True)
     leave(0, seconds=0.5)
 """

@@ -97,7 +97,7 @@ def test_a_comparison_of_runs_that_failed_or_ended_early_has_their_status(
         image.write_bytes(b"no picture")
     recipes = [f"{small_recipe}:stage-1", f"{small_recipe}:whole-images"]
     compared = ["--pairs-per-scene", "2", "--compare", *recipes]
-    assert run_command("validate", "--train-dir", train, *compared) == 1
+    assert run_command("validate", "--train-dir", train, *compared, "--workers", 0) == 1
     printed = capsys.readouterr().out
     assert printed.count("the run failed: 2 of 2 pairs got no F because of errors") == 2
     assert "gain of mAA" in printed

@@ -176,8 +176,8 @@ def test_a_validation_that_hangs_ends_at_its_limit(demo):
         (["--train-dir", "T", "--compare", "classical"], "two recipes"),
     ],
 )
-def test_contradictory_options_are_refused(demo, small_recipe, options, told, capsys):
-    places = {"T": demo.train_dir, "R": small_recipe}
+def test_contradictory_options_are_refused(demo, options, told, capsys):
+    places = {"T": demo.train_dir}
     assert run_command("validate", *(places.get(option, option) for option in options)) == 2
     captured = capsys.readouterr()
     assert (told in captured.err, captured.out) == (True, "")

@@ -1,4 +1,4 @@
-"""Two views: F and its derivatives, the Sampson distance, and the descent to a minimum."""
+"""Two views: the descent to a minimum."""
 
 import numpy as np
 import pytest
@@ -27,9 +27,6 @@ def rays(seed, n=60):
         pixels = 300 * rng.normal(size=(n, 2))
         both.append(np.column_stack([pixels, np.full(n, focal)]))
     return both
-
-
-# Three of rotation, two of the direction of translation, two focal lengths.
 
 
 @pytest.mark.parametrize("sigmas", [(0.4, 0.4), (0, 0.4), (0, 0)])

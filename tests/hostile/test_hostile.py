@@ -20,7 +20,7 @@ from room import write_template
 SOURCES = (files, images, outputs, ends, faults, weight_bombs, folders, unread)
 ALL = [case for source in SOURCES for case in source.CASES]
 # The first of each of these groups runs with the other tests, which have more of the other groups.
-QUICK = ("images", "signals", "weights", "folders")
+QUICK = ("signals", "weights")
 FIRST = {case.group: case for case in reversed(ALL) if case.group in QUICK}.values()
 MARKED = [
     pytest.param(case, id=case.id, marks=() if case in FIRST else pytest.mark.slow)

@@ -11,7 +11,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from mkpc_kaggle.matchers.contract import Placement, arrays_of
 
 # In a minibatch; of others 1
-PAIRS = {"superglue": 3, "aliked_lightglue": 3, "xfeat_lighterglue": 3}
+PAIRS = {"superglue": 2, "aliked_lightglue": 2, "xfeat_lighterglue": 2}
 
 
 def matched(name, device):

@@ -35,9 +35,6 @@ def test_indoor_weights_are_another_slot_and_another_networks_checkpoint_is_refu
         superglue.load(wrong, superglue.SuperGlueOptions(), Placement())
 
 
-# Exponentials of 300 overflow float32, so the plan must be computed with logarithms.
-
-
 def test_superpoint_finds_in_a_batch_what_it_finds_in_each_image():
     network = filled(SuperPoint(max_keypoints=20), "superpoint")
     batch = torch.rand(3, 1, 45, 62)

@@ -35,7 +35,7 @@ def figures_of(notebook: nbformat.NotebookNode) -> int:
 
 @needs_namespaces
 def test_the_tour_runs_on_a_train_side_without_a_network(demo, tmp_path):
-    # Two small units and one permutation: the figures are the same in number.
+    # Two small units: the figures are the same in number.
     more = "[scene]"
     recipe = write_recipe(tmp_path / "tour.toml", (1, 480), (2, 640), more=more)
     variables = environment(

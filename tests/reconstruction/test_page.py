@@ -40,11 +40,9 @@ def test_the_snippets_run_from_top_to_bottom(tmp_path, monkeypatch, capsys):
     assert list(pd.read_csv("submission.csv")["scene"]) == ["cluster0"] * FIRST
 
 
-def test_the_call_of_the_page_returns_models(demo, tmp_path, monkeypatch, nowhere_else):
-
+def test_the_call_of_the_page_runs(demo, tmp_path, monkeypatch, nowhere_else):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(demo.train_dir / "courtyard" / "images", "DIR")
     names: dict[str, object] = {}
     exec(compile(OURS, "docs/folder.md", "exec"), names)
-    assert isinstance(names["models"], tuple)
     assert Path("OUT/report.html").exists()

@@ -51,7 +51,7 @@ def test_a_page_has_the_counts_what_failed_the_tables_and_pictures(made):
     assert re.search("<h1>complete after .*: 3 of 4 pairs with an F</h1>", text)
     assert "1 pair without an F (" in text
     assert text.count("data:image/jpeg;base64,") == 3
-    assert "1:rectified" in text or "<h2>Units</h2>" in text
+    assert "1:rectified" in text and "<h2>Units</h2>" in text
     # No request, and no script of a file's name
     assert not re.search(r'(src|href)="(?!data:)', text)
     assert "<script" not in text

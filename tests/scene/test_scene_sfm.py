@@ -123,10 +123,9 @@ def test_points_of_a_dense_matcher_make_tracks(scene):
     assert max(distances(solution, scene)) < 1
 
 
-@pytest.mark.parametrize("count", [3, 0])
-def test_a_pair_with_few_matches_or_none_gets_the_scenes_fundamental(scene, count):
+def test_a_pair_without_matches_gets_the_scenes_fundamental(scene):
     first, *others = scene.pairs
-    few = replace(first, by_unit=(first.matches[:count],))
+    few = replace(first, by_unit=(first.matches[:0],))
     # The images of this pair have cameras by their other pairs.
     solution = reconstruct_batch((few, *others), SceneConfig())
     choice = solution.choices[0]

@@ -54,6 +54,3 @@ def test_an_option_changes_the_settings_of_its_unit(
     assert former["options"][option] != new["options"][option] == value
     # And nothing else: other results stay up to date.
     assert {**new, "options": former["options"]} == former
-
-
-# A changed threshold must not match pairs again: points do not depend on later steps.

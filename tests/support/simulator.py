@@ -74,12 +74,10 @@ MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {
 }
 
 
-def switch_off(
-    mechanism: str, change: Callable[[object, str, object], None] = setattr
-) -> None:
+def switch_off(mechanism: str) -> None:
     """Run without a mechanism of the plan from now on."""
     for owner, name, value in MECHANISMS[mechanism]:
-        change(owner, name, value)
+        setattr(owner, name, value)
 
 
 @dataclass(frozen=True)
@@ -96,8 +94,8 @@ class Scenario:
     above 1, the run adds pairs. A scene takes ``scene_seconds`` per pair, for each of up to ``candidates``. It
     crashes, runs out of memory or hangs with probability ``scene_faults``.
 
-    A share ``bad_pairs`` of the pairs, and the pairs of ``bad``, fail in each unit, in the way of ``bad_fate``
-    or in a random one. The last ``bad_places`` places fail in every job after the share ``broken`` of the limit.
+    A share ``bad_pairs`` of the pairs, and the pairs of ``bad``, fail in each unit, in a random way.
+    The last ``bad_places`` places fail in every job after the share ``broken`` of the limit.
     With ``fallback``, there is another place, where nothing is bad.
     """
 
@@ -119,17 +117,14 @@ class Scenario:
     pairs_per_image: float = 0.0
     scene_seconds: float = 0.06
     scene_faults: float = 0.0
-    scene_places: int = 1
     candidates: int = 1
     seed: int = 0
     never: str = ""  # the matcher whose worker dies whenever it runs
     bad_pairs: float = 0.0
     bad: tuple[int, ...] = ()
-    bad_fate: Cause | None = None
     bad_places: int = 0
     broken: float = 0.0
     fallback: bool = False
-    minibatch: int = 1
     crop_share: float = 1.0  # of the pairs that need their units of stage 2
 
     @property
@@ -155,7 +150,7 @@ class Scenario:
         drawn = rng.random(self.pairs)
         kinds = rng.choice(len(FATES), self.pairs, p=tuple(FATES.values()))
         bad = {*self.bad, *np.flatnonzero(drawn < self.bad_pairs).tolist()}
-        return {pair: self.bad_fate or list(FATES)[kinds[pair]] for pair in sorted(bad)}
+        return {pair: list(FATES)[kinds[pair]] for pair in sorted(bad)}
 
     @property
     def work(self) -> float:
@@ -281,18 +276,15 @@ class SimulatedSite(Site):
         makers.append(
             ("estimates", lambda: SimulatedWorker(self, self.estimate), Kind.ESTIMATE)
         )
-        for number in range(scenario.scene_places):
-            makers.append((f"scenes {number}", self.scene_worker, Kind.SCENE))
+        makers.append(("scenes 0", self.scene_worker, Kind.SCENE))
         self.places = [Place(*maker) for maker in makers]
         self.matching = self.of(Kind.MATCH)
-        for place in self.matching:
-            place.minibatch = scenario.minibatch
         if scenario.fallback:
             self.fallback = [Place("cpu", self.fallback_worker)]
 
     @property
     def scenes_beside(self) -> int:
-        return self.scenario.scene_places
+        return 1
 
     def match_worker(self, *, is_bad: bool = False) -> "SimulatedWorker":
         return SimulatedWorker(self, partial(self.match_at, is_bad, set()), RESTART_S)
@@ -351,7 +343,7 @@ class SimulatedSite(Site):
         scenario = self.scenario
         # The whole time until a loss is a fault: of the place, or of a pair.
         if is_bad and self.clock.now >= scenario.broken * scenario.limit:
-            return self.lose(scenario.bad_fate or Cause.DEVICE)
+            return self.lose(Cause.DEVICE)
         for index in job.indices:
             if index in self._fates:
                 return self.lose(self._fates[index])
