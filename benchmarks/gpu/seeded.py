@@ -119,7 +119,8 @@ def _roma_state(narrow: bool, *, is_backbone: bool) -> State:
 def _xfeat() -> nn.Module:
     from mkpc_kaggle.matchers.adapters.xfeat_lighterglue import xfeat_network
 
-    return xfeat_network(2048).net
+    network: nn.Module = xfeat_network(2048).net
+    return network
 
 
 def _kornia_state(name: str) -> State:

@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--fresh",
         action="store_true",
-        help="delete the journal of an earlier run in OUT/work",
+        help="delete the journal and the scenes of an earlier run in OUT/work",
     )
 
 

@@ -85,20 +85,12 @@ class Keys:
         cameras = [[pattern, asdict(camera)] for pattern, camera in assembly.cameras]
         # The units that make tracks: a unit's points do not depend on it, but scenes do.
         tracks = [unit.name for unit in recipe.units if unit.tracks]
+        mapper = version_of_package("pycolmap")  # pairs need none
         return cls(
             tuple(units),
             digest({name: value for name, value in mkpc.items() if name not in RULE}),
             estimate,
-            digest(
-                [
-                    SCENE_VERSION,
-                    scene,
-                    cameras,
-                    tracks,
-                    estimate,
-                    version_of_package("pycolmap"),
-                ]
-            ),
+            digest([SCENE_VERSION, scene, cameras, tracks, estimate, mapper]),
             assembly.masks,
         )
 

@@ -224,7 +224,7 @@ def undistort(models: Sequence[Any], root: Path, out: Path, made: Path) -> None:
             while files.setdefault(name, file) != file:  # of a/b.jpg and a_b.jpg
                 name = f"_{name}"
             image.name = name
-            if not (photographs / name).exists():  # an image may be in two models
+            if not (photographs / name).is_symlink():  # an image may be in two models
                 (photographs / name).symlink_to(file)
         model.extract_colors_for_all_images(photographs)
         model.write(source)

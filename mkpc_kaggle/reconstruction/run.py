@@ -202,9 +202,8 @@ def _run(
     from mkpc_kaggle.reporting.page import report_run
     from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
-    batch = (
-        printable(root.resolve().name) or "images"
-    )  # the root of the file system has no name
+    # The root of the file system has no name.
+    batch = printable(root.resolve().name) or "images"
     names = {file: file.relative_to(root).as_posix() for file in files}
     pairs = [Pair(f"{names[a]} {names[b]}", batch, str(a), str(b)) for a, b in ends]
     recipe = assembly.recipe
