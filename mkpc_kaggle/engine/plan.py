@@ -112,6 +112,10 @@ class Plan:
     # Matching
 
     @cached_property
+    def missing(self) -> Mask:
+        return self.state.missing
+
+    @cached_property
     def fit(self) -> int:
         """The length of the longest prefix of the recipe that all rows can have in the time left."""
         if not self.left:  # an unmeasured unit needs no time, but fits no more
@@ -122,7 +126,8 @@ class Plan:
         forecasts = np.array([self.costs.forecast(unit.name) for unit in state.units])
         # The share of the known pairs that need a unit, and one more that needs it
         used, done, missing = (
-            cells[rows].sum(0, np.int32) for cells in (state.used, state.done, state.missing)
+            np.array([np.count_nonzero(unit[rows]) for unit in cells.T])
+            for cells in (state.used, state.done, self.missing)
         )
         seconds = np.cumsum(missing * forecasts * (used + 1) / (done + 1))
         most = self.left * max(1, self.crew.matchers)
@@ -146,8 +151,7 @@ class Plan:
         in time, and for crops that depend on them.
         """
         state = self.state
-        missing = state.missing
-        phases = np.full_like(missing, FILL, np.int8)
+        phases = np.full_like(self.missing, FILL, np.int8)
         phases[:, : self.fit] = DEEPEN
         phases[:, state.sweep] = SWEEP
         phases[state.rows :] = NEVER
@@ -155,14 +159,17 @@ class Plan:
         # A pair that cost two workers may cost two more for each unit, so all others come first.
         costly = (state.losses[:, :-1] == GIVEN_UP).any(1)
         phases[costly] = np.maximum(phases[costly], FILL)
-        phases = np.maximum(phases, np.int8(NEVER) * ~missing)
+        phases = np.maximum(phases, np.int8(NEVER) * ~self.missing)
+        # Pairs of which an earlier unit of stage 1 is missing, and has no time
+        never = np.zeros_like(costly)
         for unit, crop in enumerate(state.is_crop.tolist()):
             mean = self.costs.mean(state.units[unit].name)
             if not self.crew.matchers or mean >= self.left:
                 phases[:, unit] = NEVER
             elif crop:
-                never = (missing & (phases == NEVER))[:, state.before[unit]]
-                phases[never.any(1), unit] = NEVER
+                phases[never, unit] = NEVER
+            if not crop:
+                never |= self.missing[:, unit] & (phases[:, unit] == NEVER)
         return phases
 
     @cached_property
@@ -232,8 +239,8 @@ class Plan:
             order = order[np.argsort(state.inliers[order], kind="stable")]
         suspect = state.is_suspect[order]
         fresh = order[~suspect]
-        fresh = np.roll(fresh, -(len(fresh) * min(self.lost, 2) // 3))
-        return np.concatenate([fresh, order[suspect]])
+        third = len(fresh) * min(self.lost, 2) // 3
+        return np.concatenate([fresh[third:], fresh[:third], order[suspect]])
 
     # Estimates and scenes
 
@@ -293,5 +300,5 @@ class Plan:
     @property
     def is_complete(self) -> bool:
         """Whether all rows have all results that this run can compute, and so do all batches."""
-        lacks = self.state.missing[: self.state.rows].any() or self.lacks_estimate.any()
+        lacks = self.missing[: self.state.rows].any() or self.lacks_estimate.any()
         return not (lacks or (self.crew.scenes and self.scene_seconds.any()))

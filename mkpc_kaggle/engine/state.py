@@ -163,7 +163,7 @@ class State:
     def scene_matches(self) -> NDArray[np.int_]:
         """The number of matches (B, C) that make a candidate's tracks, about."""
         columns = dict(zip(self.titles[:-1], self.matches.T, strict=True))
-        every = self.matches.sum(1)
+        every = self.matches.sum(1, np.int32)
         counts = [self.by_batch(columns.get(name, every)) for name in self.candidates]
         return np.transpose(counts)
 
