@@ -13,6 +13,7 @@ from IPython.core.inputtransformer2 import TransformerManager
 from sklearn.datasets import load_sample_image
 
 from mkpc_kaggle.cli import COMMANDS, make_parser
+from mkpc_kaggle.recipe import parse_recipe
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -173,6 +174,11 @@ def test_the_python_of_the_pages_runs(block, tmp_path, monkeypatch):
     names = {}
     exec(compile(block, "page", "exec"), names)
     assert names["match"].estimate.inlier_count > 50
+
+
+def test_the_recipe_of_the_pages_is_a_recipe():
+    page = (ROOT / "docs" / "recipes.md").read_text("utf-8")
+    parse_recipe(page.split("```toml\n")[1].split("```")[0], "shown")
 
 
 def test_a_folder_uses_those_above_it_and_never_those_below():
