@@ -49,18 +49,19 @@ class RaySite(Site):
         try:
             import ray
         except ModuleNotFoundError as error:
-            told = '--workers ray needs Ray, which is not installed: pip install "mkpc-kaggle[ray]"'
-            raise UserError(told) from error
+            raise UserError(
+                '--workers ray needs Ray, which is not installed: pip install "mkpc-kaggle[ray]"'
+            ) from error
         self._ray = ray
         weights = [file.path for file in assembly.weight_files.values()]
         self._needed = (*weights, *folders)
         # A program that has joined a cluster itself keeps it after the run.
-        self._has_joined = not self._ray.is_initialized()
+        self._has_joined = not ray.is_initialized()
         if self._has_joined:
-            join(self._ray, cluster)
+            join(ray, cluster)
         machines = [
             node
-            for node in self._ray.nodes()
+            for node in ray.nodes()
             if node["Alive"] and node["Resources"].get("CPU", 0) >= 1
         ]
         gpus = sum(int(node["Resources"].get("GPU", 0)) for node in machines)

@@ -37,8 +37,10 @@ SCENE_COLUMNS = [
     "points",
     "reprojection_error",
     "seconds",
+    "candidate",
+    "failure",
+    "missing",
 ]
-SCENE_COLUMNS += ["candidate", "failure", "missing"]
 
 # The store unites two databases by views. So its tables are not joined: SQLite would copy one of them.
 # A former run may have had more rows.

@@ -178,8 +178,9 @@ class Site:
     @property
     def reason(self) -> str:
         """Why places for matching are closed; empty if none is."""
-        closed = [place.closed for place in self.places if place.kind is Kind.MATCH]
-        return "; ".join(filter(None, closed))
+        return "; ".join(
+            place.closed for place in self.places if place.closed and place.kind is Kind.MATCH
+        )
 
     @property
     def scenes_beside(self) -> int:

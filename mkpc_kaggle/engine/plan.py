@@ -121,12 +121,11 @@ class Plan:
         if not self.left:  # an unmeasured unit needs no time, but fits no more
             return 0
         state = self.state
-        # Extra pairs are left out: they have a share of the time, not a claim.
-        rows = slice(state.rows)
         forecasts = np.array([self.costs.forecast(unit.name) for unit in state.units])
-        # The share of the known pairs that need a unit, and one more that needs it
+        # The share of the known pairs that need a unit, and one more that needs it. Extra pairs are left out: they
+        # have a share of the time, not a claim.
         used, done, missing = (
-            np.array([np.count_nonzero(unit[rows]) for unit in cells.T])
+            np.array([np.count_nonzero(unit[: state.rows]) for unit in cells.T])
             for cells in (state.used, state.done, self.missing)
         )
         seconds = np.cumsum(missing * forecasts * (used + 1) / (done + 1))
@@ -195,19 +194,20 @@ class Plan:
         state = self.state
         costs = self.costs
         order = self._order()
-        pairs = order[:1]
+        pair = order[0]
         wanted = self.wanted <= self.phase
-        units = np.flatnonzero(wanted[pairs[0]]).tolist()
+        units = np.flatnonzero(wanted[pair]).tolist()
         names = [state.units[unit].name for unit in units]
         seconds = list(map(costs.mean, names))
-        if self.lost or state.is_suspect[pairs[0]]:
+        if self.lost or state.is_suspect[pair]:
             units = units[:1]
-            order = pairs  # no image is decoded ahead, which could be another cause
+            # No image is decoded ahead, which could be another cause.
+            order = pairs = order[:1]
         else:
             # Near the end, a smaller minibatch still ends in time.
             size = max(1, int(min(self.crew.minibatch, self.left / max(seconds[0], 1e-9))))
             near = order[: NEIGHBOURS * size]
-            alike = (wanted[near] == wanted[pairs[0]]).all(1) & ~state.is_suspect[near]
+            alike = (wanted[near] == wanted[pair]).all(1) & ~state.is_suspect[near]
             pairs = near[alike][:size]
             # An unmeasured unit counts as infinitely long, so its cost is learnt from a job of one unit.
             known = [costs.mean(name) if costs.is_known(name) else inf for name in names]

@@ -48,7 +48,7 @@ from mkpc_kaggle.engine.state import (
     UNREADABLE,
     State,
 )
-from mkpc_kaggle.engine.store import Store, points_row
+from mkpc_kaggle.engine.store import Store, points_row, undamaged
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.scene.records import SceneRecord
@@ -95,8 +95,9 @@ class Run:
             self.about.ending = self.ending
             self._publish(is_last=True)
         self.about.unsaved = self.store.flush()  # the disk may have room again
-        # Facts that a full disk kept from the store
-        return replace(results_of(self.store), about=self.about)
+        with undamaged(self.store.directory):
+            # Facts that a full disk kept from the store
+            return replace(results_of(self.store), about=self.about)
 
     # The loop
 
@@ -131,8 +132,9 @@ class Run:
         matchers, estimators, scenes = map(self.site.of, Kind)
         # All have the same kind of device.
         minibatch = matchers[0].minibatch if matchers else 1
-        beside = min(len(scenes), self.site.scenes_beside)
-        return Crew(len(matchers), len(estimators), len(scenes), minibatch, beside)
+        return Crew(
+            len(matchers), len(estimators), len(scenes), minibatch, self.site.scenes_beside
+        )
 
     def _seconds_of(self, place: Place) -> float:
         """Return how long the worker of a place may start, or compute its job, by the costs known now."""
@@ -266,6 +268,8 @@ class Run:
                         result.unit.name, result.seconds, warm_up=result.warm_up
                     )
                     self.about.units_run += 1
+                    # It runs, so its losses are not its own. A unit that is skipped stays so.
+                    state.unit_losses[unit] *= state.dead[unit]
         self.store.put({"points": rows})
 
     def _save_estimates(self, job: Job, answer: Sequence[Estimated]) -> None:

@@ -33,9 +33,10 @@ SOURCES = ("fallback", "pair", "scene")
 # remaining units, weakest pairs first; none, since the unit does not fit in the time left, or is done
 SWEEP, CONNECT, DEEPEN, FILL, NEVER = range(5)
 PHASES = ("sweep", "connect", "deepen", "fill", "never")
-# Losses of a unit on a pair, of an estimate, or of a scene: an item that was lost this many times is given up. A
-# matcher that raised raises again, and costs no worker. An unreadable image is a fact of the input.
-GIVEN_UP, RAISED, UNREADABLE = 2, 3, 4
+# Losses of a unit on a pair, of an estimate, or of a scene: an item that was lost this many times is given up. No
+# losses: a matcher that raised raises again, and costs no worker; an unreadable image is a fact of the input.
+GIVEN_UP, RAISED, UNREADABLE = 2, 4, 8
+LOST = 3  # the bits of the number of losses
 ESTIMATE = -1  # the column of losses of estimates
 REFUSED = 1 << 30  # losses of a unit whose matcher cannot be loaded
 
@@ -148,7 +149,7 @@ class State:
     @property
     def is_suspect(self) -> Mask:
         """(N,): a job of the pair was lost, and may be lost again."""
-        return np.asarray(self.losses[:, :ESTIMATE].any(1))
+        return np.asarray((self.losses[:, :ESTIMATE] & LOST).any(1))
 
     @property
     def sweep(self) -> int:
@@ -378,7 +379,7 @@ class State:
     def has_losses(self, job: Job) -> bool:
         """Return whether a pair of a job had a lost job of the same kind."""
         columns = slice(ESTIMATE) if isinstance(job, MatchJob) else ESTIMATE
-        return bool(self.losses[job.indices, columns].any())
+        return bool((self.losses[job.indices, columns] & LOST).any())
 
     def cells(self, job: Job) -> tuple[NDArray[np.intp], ...]:
         """Return the cells of ``losses`` of a job of pairs."""
