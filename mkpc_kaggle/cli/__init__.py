@@ -7,7 +7,7 @@ import sys
 import time
 import warnings
 from collections.abc import Sequence
-from contextlib import ExitStack, nullcontext, suppress
+from contextlib import ExitStack, nullcontext
 from importlib import import_module
 from io import TextIOWrapper
 from typing import NoReturn
@@ -28,7 +28,7 @@ COMMANDS = {
     "demo": "render a small test set with known poses",
 }
 EXIT_BAD_INPUT = 2
-EXIT_BROKEN_PIPE = 128 + 13  # a shell's status for SIGPIPE, which Windows does not define
+EXIT_BROKEN_PIPE = 141  # a shell's status for SIGPIPE, which Windows does not define
 EXIT_INTERRUPTED = 128 + 2  # a shell's status for SIGINT
 
 
@@ -90,10 +90,14 @@ def _run(given: Sequence[str], started: float, printing: ExitStack) -> int:
     # After parsing: --help and errors in options need no thread that prints.
     printing.enter_context(parsed.printing())
     status = int(parsed.run(parsed) or 0)
-    with suppress(OSError, ValueError):  # the disk is full, or the stream closed
+    try:
         # A slow reader is waited for, except in a run, whose lines another thread prints.
         if sys.stdout is not None and parsed.printing is nullcontext:
             sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except (OSError, ValueError):  # the disk is full, or the stream closed
+        pass
     return status
 
 

@@ -36,7 +36,10 @@ def test_a_reader_that_leaves_ends_the_command_quietly():
     os.close(reader)
     with os.fdopen(writer, "wb") as out:
         command = [sys.executable, "-m", "mkpc_kaggle", "recipes"]
-        done = subprocess.run(command, stdout=out, stderr=subprocess.PIPE, check=False)
+        env = {**os.environ, "PYTHONUNBUFFERED": ""}  # the output waits in a buffer
+        done = subprocess.run(
+            command, stdout=out, stderr=subprocess.PIPE, env=env, check=False
+        )
     assert (done.returncode, done.stderr) == (141, b"")
 
 
